@@ -242,6 +242,11 @@ class BasicDrives(Generic[M]):
         """
         raise NotImplementedError
 
+    def commands_of(self, can_id: int, data: bytes) -> list[tuple[int, Order]]:
+        """`command_of`, for frames that may order several joints."""
+        found = self.command_of(can_id, data)
+        return [] if found is None else [found]
+
     # ---- states
 
     def power(self, joint: int) -> Power:

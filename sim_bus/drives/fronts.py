@@ -9,7 +9,9 @@ from sim_bus.drives.cubemars import CubeMarsDrive
 from sim_bus.drives.damiao import DamiaoDrive
 from sim_bus.drives.moteus import MoteusDrive
 from sim_bus.drives.motor import Motor
+from sim_bus.drives.myactuator import MyActuatorDrive
 from sim_bus.drives.odrive import ODriveAxis
+from sim_bus.drives.piper import build as build_piper
 from sim_bus.drives.robstride import RobStrideDrive
 from sim_bus.drives.simulated_drive import Front, SimulatedDrive
 
@@ -28,6 +30,8 @@ FAMILIES: dict[str, Build] = {
     "robstride": _each(RobStrideDrive),
     "moteus": _each(MoteusDrive),
     "odrive": _each(ODriveAxis),
+    "myactuator": _each(MyActuatorDrive),
+    "piper": build_piper,
 }
 GROUP = "armlink.simulated_drives"
 """Entry-point group of functions like those of FAMILIES, for families of other packages."""

@@ -51,10 +51,15 @@ class SimulatedDrive:
         if not self.unplugged:
             self._send(can_id | CLASSICAL * ("drive.classic" in self.faults), data)
 
+    @property
+    def speed(self) -> float:
+        """Of its motor, as it measures it [rad/s]."""
+        return self.motor.velocity
+
     def told(self) -> MitFeedback:
         """Position, velocity and torque of its motor, as its next frame tells them."""
         motor = self.motor
-        true = MitFeedback(motor.position, motor.velocity, motor.torque)
+        true = MitFeedback(motor.position, self.speed, motor.torque)
         if not self.false.any:
             return true
         pairs = zip(QUANTITIES, true, strict=True)

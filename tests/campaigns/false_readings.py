@@ -28,7 +28,10 @@ from sim_bus.drives.drive_faults import QUANTITIES
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-ALL = ("six-damiao", "six-robstride", "six-cubemars", "six-moteus", "six-odrive", "six-cia402", "sarcos")
+ALL = (
+    *("six-damiao", "six-robstride", "six-cubemars", "six-moteus", "six-odrive", "six-myactuator"),
+    *("six-cia402", "sarcos"),
+)
 HOW = ("forged", "frozen", "doubled", "scaled")
 LEAST, MOST = 0.2, 5.0
 """Factors of scaled readings."""

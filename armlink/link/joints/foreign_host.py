@@ -59,9 +59,9 @@ class ForeignHost:
             if self._sync is not None and group is not None:
                 self._newest[can_id] = can_id, data
                 return False
-            found = each.drives.command_of(can_id & ~each.tag, data)
-            if found is not None and found[0] >= 0:
-                place = each.places[found[0]]
+            found = each.drives.commands_of(can_id & ~each.tag, data)
+            if found and found[0][0] >= 0:
+                place = each.places[found[0][0]]
                 begins = self._sync is None and self._leader in (None, place)
                 self._leader = place if self._leader is None else self._leader
                 if begins:
@@ -95,11 +95,11 @@ class ForeignHost:
         for can_id, data in commands:
             group = self._group_of.get(can_id)
             for each in self._unnamed if group is None else (group,):
-                found = each.drives.command_of(can_id & ~each.tag, data)
-                if found is not None:
-                    joints = range(len(each.places)) if found[0] < 0 else (found[0],)
-                    for joint in joints:
+                found = each.drives.commands_of(can_id & ~each.tag, data)
+                for number, order in found:
+                    for joint in range(len(each.places)) if number < 0 else (number,):
                         place = each.places[joint]
-                        ordered[place] = self._values.ordered(place, found[1])
+                        ordered[place] = self._values.ordered(place, order)
+                if found:
                     break
         return ordered

@@ -18,7 +18,7 @@ from armlink.drives.odrive.drives import find_drives as heard_odrives
 from armlink.drives.odrive.frames import Heartbeat, Message, identifier, pack
 from sim_bus.bus.lock_step import LockStepBus
 
-ARMS = ["six-cia402", "openarm", "six-robstride", "six-moteus", "six-odrive"]
+ARMS = ["six-cia402", "openarm", "six-robstride", "six-moteus", "six-odrive", "six-myactuator"]
 
 
 def reads(can_id: int, data: bytes) -> bool:
@@ -32,6 +32,8 @@ def reads(can_id: int, data: bytes) -> bool:
         return number >> 24 == 17 or (number >> 8 == 0xFD and data == bytes(8))
     if number == 0x7FF:  # Damiao: read, and refresh
         return data[2] in (0x33, 0xCC)
+    if 0x141 <= number <= 0x160:  # MyActuator: angle, version, model
+        return data[0] in (0x92, 0xB2, 0xB5)
     return 0x601 <= number <= 0x67F and data[0] in (0x40, 0x60, 0x70)  # SDO upload
 
 
@@ -141,12 +143,12 @@ def test_an_id_given_twice_is_refused(tmp_path, monkeypatch, capsys):
     assert run(["new", "--out", "found.yaml", "--bus", "armlink_sim:there.yaml"]) == 3
 
 
-@pytest.mark.parametrize("arm", ["six-damiao", "six-robstride", "six-cubemars"])
+@pytest.mark.parametrize("arm", ["six-damiao", "six-robstride", "six-cubemars", "six-myactuator"])
 def test_what_is_asked_of_all_families_commands_no_drive(arm, sent):
     """All requests to a bus on which nothing answers, heard by drives that have power."""
     told = BusDrives(LockStepBus(arm=Bench("six-cubemars").arm)).told
-    assert told == "looked for canopen, cubemars, damiao, moteus, odrive, robstride"
-    assert {0x7FF, 0x601, 0xFD01 | EXTENDED, 0x8001 | EXTENDED} <= {can_id for can_id, _ in sent}
+    assert told == "looked for canopen, cubemars, damiao, moteus, myactuator, odrive, robstride"
+    assert {0x7FF, 0x601, 0x141, 0x160, 0xFD01 | EXTENDED, 0x8001 | EXTENDED} <= {can_id for can_id, _ in sent}
     disturbed(arm, sent)
 
 

@@ -10,7 +10,7 @@ from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
 from sim_bus.bus.lock_step import LockStepBus
 
-FROM_CURRENT = ("six-damiao", "six-cubemars", "six-moteus", "six-odrive", "six-robstride")
+FROM_CURRENT = ("six-damiao", "six-cubemars", "six-moteus", "six-odrive", "six-robstride", "six-myactuator")
 SHOULDER = 1
 
 

@@ -34,7 +34,7 @@ FLOODS: dict[str, Callable[[list[Frame]], list[Frame]]] = {
     "remote": lambda sent: [(REMOTE | 0x7F0, b"")],
     "the drives' own": lambda sent: sent,
 }
-FAMILIES = ("cia402", "damiao", "robstride", "cubemars", "moteus", "odrive")
+FAMILIES = ("cia402", "damiao", "robstride", "cubemars", "moteus", "odrive", "myactuator")
 ROWS = sorted(
     random.Random(3).sample([*product(FAMILIES, FLOODS, (100, 1100))], 48),
     key=lambda row: (row[2], row[0] == "moteus"),

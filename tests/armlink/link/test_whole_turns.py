@@ -23,7 +23,7 @@ from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 TURN = 2 * math.pi
-FAMILIES = ("six-damiao", "six-cubemars", "six-moteus", "six-robstride", "six-odrive", "six-cia402")
+FAMILIES = ("six-damiao", "six-cubemars", "six-moteus", "six-robstride", "six-odrive", "six-myactuator", "six-cia402")
 SEED = 5207
 SHORT, LONG = 3, 200
 """Draws a family."""
@@ -185,7 +185,7 @@ def test_every_joint_that_lost_a_turn_is_named():
     assert (zeros_named(text, "base"), zeros_named(text, "elbow")) == ([0.0], [0.4])
 
 
-@pytest.mark.parametrize("name", ["six-damiao", "six-cubemars", "six-moteus", "six-robstride"])
+@pytest.mark.parametrize("name", ["six-damiao", "six-cubemars", "six-moteus", "six-robstride", "six-myactuator"])
 def test_a_drive_that_wakes_anew_between_start_and_enable_gets_no_power(name):
     bus = bus_of(name)
     with Link(host_of(name, {}), bus) as link:

@@ -35,6 +35,7 @@ def drives(kd: float) -> dict[str, dict[str, Any]]:
         "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": kd},
         "moteus": {"family": "moteus", "id": 4},
         "odrive": {"family": "odrive", "node": 5},
+        "myactuator": {"family": "myactuator", "id": 1, "model": "X8-25", "timeout_ms": 250},
     }
 
 

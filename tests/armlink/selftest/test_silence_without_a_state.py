@@ -15,10 +15,18 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
+FAMILIES = {
+    "cubemars": {"family": "cubemars", "model": "AK80-9", "kp": 30, "kd": 1.0, "can_timeout": 4000},
+    "myactuator": {"family": "myactuator", "model": "X8-25", "timeout_ms": 100},
+}
+TIMEOUTS = {"cubemars": "can_timeout", "myactuator": "timeout_ms"}
+TYPES = {"cubemars": "CubeMars AK80-9", "myactuator": "MyActuator X825"}
+each_family = pytest.mark.parametrize("family", FAMILIES)
 
-def content(upright=False, **keys):
+
+def content(family, upright=False, **keys):
     """Two joints that hang, or, where the first axis is upright, one that gravity never loads."""
-    drive = {"family": "cubemars", "model": "AK80-9", "kp": 30, "kd": 1.0, "can_timeout": 4000} | keys
+    drive = FAMILIES[family] | keys
     row = {"rated_torque": 9.0, "max_torque": 15.0, "max_torque_rate": 100.0}
     names = ("hinge_1", "hinge_2")
     tilt = {"alpha": 1.5707963} if upright else {}
@@ -55,33 +63,38 @@ def checked(described, fault=None):
     return results, simulated
 
 
-def test_a_drive_with_a_can_timeout_lets_go_of_a_joint_that_hung_at_rest():
+@each_family
+def test_a_drive_with_a_timeout_lets_go_of_a_joint_that_hung_at_rest(family):
     """Where it hangs it carries nothing: it is led to where gravity pulls at it, and falls from there."""
-    results, simulated = checked(content())
+    results, simulated = checked(content(family))
     for name in ("hinge_1", "hinge_2"):
         silent = results[name, "silence"]
         assert silent.outcome == "passed", silent.found
         assert silent.found.startswith("falls within")
-    assert not any(simulated.device(joint).motor.powered and simulated.device(joint).command.kp for joint in (0, 1))
+    drives = [simulated.device(joint) for joint in (0, 1)]
+    assert not any(drive.motor.powered and (family != "cubemars" or drive.command.kp) for drive in drives)
 
 
-def test_a_can_timeout_that_is_stated_and_not_set_is_found():
-    results, _ = checked(content(), "watchdog.off")
+@each_family
+def test_a_timeout_that_is_stated_and_not_set_is_found(family):
+    results, _ = checked(content(family), "watchdog.off")
     assert results["hinge_1", "silence"].outcome == "failed"
     assert "keeps on within" in results["hinge_1", "silence"].found
     assert "do not drive it" in results["hinge_1", "silence"].found
     assert results["hinge_2", "silence"].outcome == "passed"
 
 
-def test_a_joint_that_carries_no_load_shows_nothing_and_that_is_said():
-    results, _ = checked(content(upright=True))
+@each_family
+def test_a_joint_that_carries_no_load_shows_nothing_and_that_is_said(family):
+    results, _ = checked(content(family, upright=True))
     assert results["hinge_1", "silence"].outcome == "not run"
     assert "reports no state, and the joint carries no load in this pose" in results["hinge_1", "silence"].found
     assert results["hinge_2", "silence"].outcome == "passed"
 
 
-def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path, monkeypatch, capsys):
-    described = content(can_timeout=0)
+@each_family
+def test_without_a_timeout_it_is_scanned_and_checked_and_not_driven(family, tmp_path, monkeypatch, capsys):
+    described = content(family, **{TIMEOUTS[family]: 0})
     arm = parse_arm(described, Path("pair.yaml"))
     simulated = SimulatedArm(arm, Truth.of(arm), 1)
     with Link(arm, LockStepBus(arm=simulated)) as link:
@@ -92,12 +105,12 @@ def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path
     monkeypatch.chdir(tmp_path)
     Path("pair.yaml").write_text(yaml.safe_dump(described))
     assert run(["scan", "pair.yaml"]) == 0
-    assert capsys.readouterr().out.count("CubeMars AK80-9") == 2
+    assert capsys.readouterr().out.count(TYPES[family]) == 2
     assert run(["check", "pair.yaml", "--json", "-"]) == 1
     checks = {(each["joint"], each["check"]): each for each in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["hinge_1", "answers"]["outcome"] == "passed"
     assert checks["hinge_1", "silence"]["outcome"] == "failed"
-    assert "`can_timeout` is not given in the `drive:` section" in checks["hinge_1", "set-up"]["found"]
+    assert f"`{TIMEOUTS[family]}` is not given in the `drive:` section" in checks["hinge_1", "set-up"]["found"]
     assert (
         "if its host died, its drive would keep on with the last command"
         in checks["hinge_1", "enables and holds"]["found"]

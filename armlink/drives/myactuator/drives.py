@@ -1,0 +1,356 @@
+"""MyActuator RMD-X drives on one bus (V3 protocol): a command and a request for the angle a cycle, and their replies.
+
+The reply to a command tells the angle in whole degrees, so it is asked for in steps of 0.01° besides. No reply tells
+whether the motor has power: a drive is on from the first command that it answers. One drive after the other is asked
+for its errors and for the time since its start. A drive that got no command within its time-out has let go, and follows
+the next command at once, so the host counts it as stopped by the time alone.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
+from armlink.bus.port import Frame
+from armlink.drives.base import BROADCAST, Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.family import Discovery, Family
+from armlink.drives.findings import FoundDrive
+from armlink.drives.myactuator import frames
+from armlink.drives.myactuator.frames import ANGLE, COMMAND_ID, CURRENT, LAST_ID, REPLY_ID, RmdCommand, request
+from armlink.drives.myactuator.settings import MyActuatorSettings
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.searched_bus import SearchedBus
+from armlink.drives.traits import Traits
+from armlink.errors import BadInput, BusFault
+
+T = TypeVar("T")
+TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
+"""Of a drive with the default keys; with a time-out it lets go."""
+POLLED = (RmdCommand.ERROR, RmdCommand.RUNTIME)
+CLOCK_TOLERANCE = 1000
+"""A time since the start that is further off than this since it was last told is that of a drive that has restarted
+[ms]: how late a reply may come to a host that stood still."""
+LOADED = 0.02
+"""A torque above this share of its limit shows whether the drive still makes it."""
+FOLLOWS = 0.5
+"""A drive that makes less than this share of the torque that it made before does not follow any more."""
+
+
+@dataclass
+class MyActuatorMemory(DriveMemory):
+    on: bool | None = None
+    """Follows its commands, as far as the newest that was answered tells; None: not known."""
+    awaited: int = 0
+    """The command whose reply says what the drive does from now on."""
+    commanded: float = -math.inf
+    """When the newest command was made [s]."""
+    stopping: bool = False
+    """It was told to stand still, and has answered."""
+    stopped: bool = False
+    """It was left without commands for longer than its time-out."""
+    torque: float = math.nan
+    """[N·m]."""
+    asked: bool = False
+    """The next state tells whether it still makes torque."""
+    error: int = 0
+    started: tuple[float, int] | None = None
+    """When it told its time since the start [s], and that time [ms]."""
+    restarted: bool = False
+    cycles: int = 0
+
+
+class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        """Nothing is sent. Raises BadInput where a CANopen node on the bus would take replies for its own commands."""
+        super().__init__(joints, TRAITS, MyActuatorMemory)
+        self._traits = [
+            replace(traits, silence="falls") if settings.timeout_ms else traits
+            for traits, settings in zip(self._traits, self.settings, strict=True)
+        ]
+        self._joint_of = {settings.id: joint for joint, settings in enumerate(self.settings)}
+        self._spare_canopen(arm)
+
+    def _spare_canopen(self, arm: ArmFile) -> None:
+        own = {row.bus for row in self.rows}
+        for joint in arm.require_link().joints:
+            node = getattr(joint.settings, "node", 0) if joint.settings.family == "canopen" else 0
+            if joint.bus in own and node - 0x40 in self._joint_of:
+                raise BadInput(
+                    f"{arm.path}: {joint.name}: node {node} takes replies of the MyActuator drive {node - 0x40} "
+                    "for commands (200h + node): give one of them another id"
+                )
+
+    # ---- identifiers
+
+    def routes(self) -> Mapping[int, int]:
+        return {REPLY_ID + drive: joint for drive, joint in self._joint_of.items()}
+
+    def commands(self) -> Mapping[int, str]:
+        found = {frames.ALL_ID: "command to all MyActuator drives", frames.SET_ID: "id to all MyActuator drives"}
+        for drive, joint in self._joint_of.items():
+            found |= {base + drive: f"command to {self.names[joint]}" for base in (COMMAND_ID, frames.MOTION_ID)}
+        return found
+
+    def cycle_bits(self) -> float:
+        """Command, angle and their replies, and one drive's poll."""
+        return (4 * self.m + 2) * longest_frame_bits(8)
+
+    # ---- before the cycle
+
+    def _ask(self, ask: Ask, joint: int, command: RmdCommand, decoded: Callable[[bytes], T]) -> T | None:
+        """Ask for what this command's reply has, decoded; None where no reply comes."""
+        drive = self.settings[joint].id
+
+        def reply(can_id: int, data: bytes) -> T | None:
+            mine = can_id == REPLY_ID + drive and len(data) == 8 and data[0] == command
+            return decoded(data) if mine else None
+
+        return ask((COMMAND_ID + drive, request(command)), reply)
+
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        told = self._ask(ask, joint, RmdCommand.MODEL, frames.unpack_model)
+        if told is None:
+            return self.absent(joint)
+        version = self._ask(ask, joint, RmdCommand.VERSION, frames.unpack_count)
+        model, stated = frames.model_named(told), self.settings[joint].model
+        wrong = f"the arm file states model {stated}" if model and stated and model != stated else ""
+        return self.present(joint, f"MyActuator {told}".strip(), firmware=str(version or ""), mismatch=wrong)
+
+    def positions(self, ask: Ask) -> list[float]:
+        told = [self._ask(ask, joint, RmdCommand.ANGLE, frames.unpack_angle) for joint in range(self.m)]
+        return [math.nan if each is None else each for each in told]
+
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        """Off, and read; nothing is written, for these drives keep what is written in their flash."""
+        settings, name = self.settings[joint], self.names[joint]
+        off = self._ask(ask, joint, RmdCommand.OFF, bytes)
+        position = self._ask(ask, joint, RmdCommand.ANGLE, frames.unpack_angle)
+        told = self._ask(ask, joint, RmdCommand.ERROR, frames.unpack_error)
+        if off is None or position is None or told is None:
+            raise BusFault(
+                f"{name}: no answer from {settings.address}: check that the drive is powered, that its id and its bit "
+                "rate are right, and that no active reply (B6h) is set in it"
+            )
+        self.memory[joint] = MyActuatorMemory(limits, None, position, 0.0, on=False, error=told[1])
+        self.powers[joint] = Power.FAULT if told[1] else Power.OFF
+        self.faults[joint] = frames.error_text(told[1])
+        notes = [_watched(settings), "the torque constant is taken from the arm file, since the drive tells none"]
+        planned = self._ask(ask, joint, RmdCommand.ACCELERATION, frames.unpack_count)
+        if planned:
+            notes.append(
+                f"it plans its own way to each position target, with {planned} °/s²: set acceleration and deceleration "
+                "of its position loop to 0, so that it follows targets as they come"
+            )
+        return Setup(
+            position=position,
+            torque=0.0,
+            position_step=ANGLE,
+            modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
+            notes=tuple(notes),
+            scales={"torque constant, N·m/A": settings.constant},
+        )
+
+    # ---- the cycle
+
+    def _frame(self, joint: int, data: bytes) -> Frame:
+        return COMMAND_ID + self.settings[joint].id, data
+
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known = self.memory[joint]
+        self.limits_of(joint)
+        if known.on and now - known.commanded > (self.settings[joint].timeout_ms / 1000 or math.inf):
+            known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
+        known.sent, data = None, request(RmdCommand.STATUS)
+        if order.power is Power.ON and known.on:
+            known.stopping, data = False, self._command(joint, order)
+        elif order.power is Power.ON and order.walk and not (known.on or known.error or known.restarted):
+            # by position whatever the mode is: a torque does not open a brake
+            data = self._command(joint, order._replace(mode=Mode.POSITION, position=known.position))
+            known.awaited, known.stopped = data[0], False
+        elif order.power is Power.STOPPED and known.on:
+            if not known.stopping:
+                data = request(RmdCommand.STOP)
+                known.awaited = data[0]
+        elif known.on is not False:
+            known.on, known.stopping, data = None, False, request(RmdCommand.OFF)
+            known.awaited = data[0]
+        known.commanded = now
+        turn, place = divmod(known.cycles, self.m)
+        known.cycles += 1
+        polls = [request(POLLED[turn % len(POLLED)])] if place == joint else []
+        return [self._frame(joint, each) for each in (data, request(RmdCommand.ANGLE), *polls)]
+
+    def _command(self, joint: int, order: Order) -> bytes:
+        """Raises ValueError for numbers that are not finite."""
+        limits = self.limits_of(joint)
+        if order.mode == Mode.TORQUE:
+            quantum = CURRENT * self.settings[joint].constant
+            most = min(math.floor(limits.max_torque / quantum), frames.MOST_CURRENT)
+            data = frames.pack_torque(max(-most, min(most, _steps(order.torque, quantum))))
+        else:
+            _steps(order.velocity, ANGLE)
+            steps = max(-frames.MOST_ANGLE, min(frames.MOST_ANGLE, _steps(order.position, ANGLE)))
+            if limits.lower <= order.position <= limits.upper:
+                steps = max(math.ceil(limits.lower / ANGLE), min(math.floor(limits.upper / ANGLE), steps))
+            speed = min(math.ceil(limits.max_velocity / frames.SPEED), frames.MOST_SPEED)
+            data = frames.pack_position(steps, speed)
+        self.memory[joint].sent = self._order_of(joint, data)
+        return data
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        joint = self._joint_of.get(can_id - REPLY_ID)
+        if joint is None or len(data) != 8:
+            return None
+        known, command = self.memory[joint], data[0]
+        if command == RmdCommand.ANGLE:
+            known.position = frames.unpack_angle(data)
+            return Reading(joint, known.position)
+        if command == known.awaited:
+            known.awaited = 0
+            known.on, known.stopping = command != RmdCommand.OFF, command == RmdCommand.STOP
+        temperature = velocity = torque = math.nan
+        if command in frames.STATES:
+            temperature, current, velocity = frames.unpack_state(data)
+            torque = current * self.settings[joint].constant
+            self._judge(joint, torque)
+            known.velocity, known.torque = velocity, torque
+        elif command == RmdCommand.ERROR:
+            temperature, known.error = frames.unpack_error(data)
+        elif command == RmdCommand.RUNTIME:
+            self._note_runtime(joint, frames.unpack_count(data), now)
+        elif command not in (RmdCommand.OFF, RmdCommand.STOP):
+            return None
+        fault = "has restarted" if known.restarted else frames.error_text(known.error)
+        power = Power.FAULT if fault else self._power(known)
+        return self.note(Reading(joint, math.nan, velocity, torque, math.nan, temperature, power, fault))
+
+    def _judge(self, joint: int, torque: float) -> None:
+        """Whether a drive that was asked still makes torque, by a reading of it [N·m]."""
+        known = self.memory[joint]
+        if not known.asked or known.limits is None:
+            return
+        known.asked = False
+        shown = abs(known.torque) > LOADED * known.limits.max_torque
+        follows = torque * math.copysign(1.0, known.torque) > FOLLOWS * abs(known.torque)
+        known.on, known.stopped = (follows if shown else None), shown and not follows
+
+    def _note_runtime(self, joint: int, runtime: int, now: float) -> None:
+        known = self.memory[joint]
+        if known.started is not None:
+            then, before = known.started
+            passed = (runtime - before) % 2**32
+            if passed > 1000 * (now - then) + CLOCK_TOLERANCE:
+                known.restarted, known.on = True, None  # what it would go on with is by another zero
+        known.started = now, runtime
+
+    @staticmethod
+    def _power(known: MyActuatorMemory) -> Power:
+        if known.stopped:
+            return Power.STOPPED
+        if known.on:
+            return Power.STOPPED if known.stopping else Power.ON
+        return Power.UNKNOWN if known.on is None else Power.OFF
+
+    # ---- states
+
+    def state_request(self, joint: int) -> list[Frame]:
+        self.memory[joint].asked = True
+        return [self._frame(joint, request(RmdCommand.STATUS))]
+
+    def lets_go(self, joint: int) -> bool:
+        return not self.memory[joint].on
+
+    def own_stop(self, joint: int) -> str:
+        if not self.memory[joint].stopped:
+            return ""
+        return f"{self.where(joint)}: no command came within its time-out, so it has switched its torque off"
+
+    def has_restarted(self, joint: int) -> bool:
+        return self.memory[joint].restarted
+
+    def forget(self, restarts: bool = False) -> None:
+        super().forget(restarts)
+        for known in self.memory:
+            known.stopped = False
+            if restarts:
+                known.restarted, known.started = False, None
+
+    def poll(self, first: bool) -> list[Frame]:
+        wanted = (RmdCommand.STATUS, RmdCommand.ANGLE)
+        return [self._frame(joint, request(each)) for joint in range(self.m) for each in wanted]
+
+    # ---- beside another host
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        joint = BROADCAST if can_id == frames.ALL_ID else self._joint_of.get(can_id - COMMAND_ID)
+        if joint is None or (joint == BROADCAST and data[:1] == bytes([RmdCommand.TORQUE])):
+            return None  # one current is another torque in each model
+        order = self._order_of(max(joint, 0), data)
+        return None if order is None else (joint, order)
+
+    def _order_of(self, joint: int, data: bytes) -> Order | None:
+        """The order that a command gives, None for what is none."""
+        if len(data) != 8:
+            return None
+        if data[0] == RmdCommand.TORQUE:
+            torque = frames.unpack_torque(data) * CURRENT * self.settings[joint].constant
+            return no_order()._replace(mode=Mode.TORQUE, torque=torque, kp=0.0, kd=0.0)
+        if data[0] == RmdCommand.POSITION:
+            position = frames.unpack_position(data)[0] * ANGLE
+            return no_order()._replace(mode=Mode.POSITION, position=position, torque=0.0, kp=0.0, kd=0.0)
+        powers: dict[int, Power] = {RmdCommand.OFF: Power.OFF, RmdCommand.STOP: Power.STOPPED}
+        return no_order()._replace(power=powers[data[0]]) if data[0] in powers else None
+
+
+def _steps(value: float, step: float) -> int:
+    """Nearest number of steps; raises ValueError for a value that is not finite."""
+    if not math.isfinite(value):
+        raise ValueError(f"the order is {value}: expected a finite number")
+    return round(value / step)
+
+
+def _watched(settings: MyActuatorSettings) -> str:
+    if settings.timeout_ms:
+        return (
+            f"the time-out of {settings.timeout_ms} ms is taken from the arm file: it cannot be read over CAN, so "
+            "check what the drive does in silence"
+        )
+    store = frames.timeout_command(100).hex().upper()
+    return (
+        "`timeout_ms` is not given in the `drive:` section: the drive keeps on with its last command after its host "
+        f"died; store a time-out in it once, 100 ms by the frame {COMMAND_ID + settings.id:03X}#{store}, and state it"
+    )
+
+
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By the model of every id."""
+    asked = [(COMMAND_ID + drive, request(RmdCommand.MODEL)) for drive in range(1, LAST_ID + 1)]
+    answers = [
+        (can_id - REPLY_ID, frames.unpack_model(data))
+        for can_id, data in bus.gather(asked)
+        if 1 <= can_id - REPLY_ID <= LAST_ID and len(data) == 8 and data[0] == RmdCommand.MODEL
+    ]
+    count, told = Counter(drive for drive, _ in answers), dict(answers)
+    found = []
+    for drive in sorted(told):
+        named = frames.model_named(told[drive])
+        model, rated = named or frames.MOST_TORQUE, frames.RATINGS[named][0] if named else math.nan
+        note = "" if named else f"model {model} assumed: any other makes less than is asked of it; "
+        each = FoundDrive(
+            *("myactuator", drive, f"id {drive}", {"id": drive, "model": model}),
+            rated_torque=rated,
+            max_torque=rated,
+            model=told[drive],
+            note=f"{note}its time-out is not told: store one in it (B3h), and state timeout_ms",
+            answers=count[drive],
+        )
+        found.append(each)
+    return found
+
+
+SEARCH = Discovery("model (B5h) of ids 1 to 32", find_drives, ("canopen", "damiao", "moteus", "odrive"))
+SUMMARY = "MyActuator RMD-X with V3 drives (protocol V3.4 to V4.2)"
+FAMILY = Family("myactuator", TRAITS, MyActuatorSettings, MyActuatorDrives, discovery=SEARCH, summary=SUMMARY)
