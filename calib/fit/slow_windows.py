@@ -1,6 +1,6 @@
 """Rows for a field calibration: slow windows of a recording, or the unloaded readings of sweeps."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from armlink.recording.recording import Recording
 from armlink.torque_calibration import TorqueCalibration
 from calib.dataset import SweepData
 from calib.fit.sweep_readings import sweep_readings
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 
 WINDOW = 0.25
@@ -26,8 +26,50 @@ FEWEST_ROWS = 12
 """Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
 
 
+@dataclass(frozen=True, eq=False)
+class WindowAverages:
+    """Averages of W windows of a recording; all (W, n) but `slow`."""
+
+    position: Array
+    """[rad]"""
+    velocity: Array
+    """[rad/s]"""
+    acceleration: Array
+    """[rad/s²]"""
+    torque: Array
+    """[N·m]"""
+    sigma: Array
+    """Standard deviation of the torque, by its scatter about a straight line [N·m]."""
+    direction: Array
+    """Sign of each joint's last motion."""
+    slow: Mask
+    """WindowAverages in which all joints move slowly and steadily (W,)."""
+
+
+def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowAverages:
+    """Raises BadInput where there is no window."""
+    windows = _windows(t)
+    if not windows:
+        raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
+    slopes = np.array([_slope(t[each], position[each]) for each in windows])
+    middles = np.array([t[each].mean() for each in windows])
+    change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
+    padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, position.shape[1]))
+    steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
+    means = np.array([position[each].mean(axis=0) for each in windows])
+    return WindowAverages(
+        position=means,
+        velocity=slopes,
+        acceleration=np.array([2 * np.polyfit(t[each] - t[each].mean(), position[each], 2)[0] for each in windows]),
+        torque=np.array([torque[each].mean(axis=0) for each in windows]),
+        sigma=np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in windows]),
+        direction=directions(means),
+        slow=(np.abs(slopes).max(axis=1) <= SLOW) & steady,
+    )
+
+
 def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:
-    """Windows of a recording in which all joints move slowly and steadily.
+    """WindowAverages of a recording in which all joints move slowly and steadily.
 
     `held` (n,) is what the controllers held: what they sent is turned back into the sensors' own readings. Raises
     BadInput if there is no joint torque, or nothing slow enough.
@@ -38,32 +80,20 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
             "torque sensors"
         )
     keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
-    t, position = recording.t[keep], recording.position[keep]
-    torque = held.apply(recording.torque[keep])
-    windows = _windows(t)
-    if not windows:
-        raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
-    slopes = np.array([_slope(t[each], position[each]) for each in windows])
-    middles = np.array([t[each].mean() for each in windows])
-    change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
-    padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, recording.n))
-    steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
-    slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
+    windows = windows_of(recording.t[keep], recording.position[keep], held.apply(recording.torque[keep]), source)
+    slow = windows.slow
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
             f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are "
             f"needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} rad/s"
         )
-    means = np.array([position[each].mean(axis=0) for each in windows])
-    chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
-    sigma = np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in chosen])
-    typical = np.sqrt(np.median(sigma**2, axis=0))
+    typical = np.sqrt(np.median(windows.sigma[slow] ** 2, axis=0))
     return StaticReadings(
-        means[slow],
-        np.array([torque[each].mean(axis=0) for each in chosen]),
+        windows.position[slow],
+        windows.torque[slow],
         np.maximum(typical, 1e-6),
-        direction=_directions(means)[slow],
-        series=np.full(len(chosen), number),
+        direction=windows.direction[slow],
+        series=np.full(slow.sum(), number),
     )
 
 
@@ -81,7 +111,7 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
 
 
 def _windows(t: Array) -> list[slice]:
-    """Windows of WINDOW seconds with enough samples and without gaps."""
+    """WindowAverages of WINDOW seconds with enough samples and without gaps."""
     windows, begin = [], 0
     while begin < len(t):
         end = int(np.searchsorted(t, t[begin] + WINDOW))
@@ -105,7 +135,7 @@ def _scatter(t: Array, values: Array) -> Array:
     return scatter
 
 
-def _directions(positions: Array) -> Array:
+def directions(positions: Array) -> Array:
     """Sign of each joint's last motion of at least MOVED, row by row (K, n)."""
     direction, now = np.zeros_like(positions), np.zeros(positions.shape[1])
     anchor = positions[0].copy()

@@ -38,6 +38,7 @@ def set_body(model: Any, body: int, anchor: Array, total: Array) -> bool:
     possible = closest_possible(values)
     model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass, anchor + centre, possible
     mujoco_quaternion(model.body_iquat[body], axes)
+    model.body_sameframe[body] = 0  # else a body whose frames were one keeps its old centre of mass
     return bool(np.allclose(possible, values, rtol=1e-3, atol=1e-9) and mass == total[0])
 
 
