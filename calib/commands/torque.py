@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.commands.options import JsonFile, Store
+from calib.commands.options import JsonFile, Store, Tool
 
 if TYPE_CHECKING:
     from gcomp.arm.arm import Arm
@@ -25,6 +25,7 @@ def torque(
         str | None,
         typer.Option(help="Id of a gravity record; by default the inertials of the model, or else the current record."),
     ] = None,
+    tool: Tool = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -40,7 +41,7 @@ def torque(
     from calib.commands.poses_csv import load_poses
     from gcomp.gravity.torque import gravity_torque
 
-    described, beta, source = _model(arm, base, tip, record, store)
+    described, beta, source = _model(arm, base, tip, record, tool, store)
     poses = load_poses(q, described.n)
     answer = gravity_torque(described, beta, poses)
     table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
@@ -56,11 +57,12 @@ def torque(
 
 
 def _model(
-    arm: str, base: str | None, tip: str | None, record: str | None, store: str | None
+    arm: str, base: str | None, tip: str | None, record: str | None, tool: str | None, store: str | None
 ) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     from armlink.errors import BadInput, Refused
     from calib.arm.stated_model import stated_model
+    from calib.arm.tool import parse_tool, tool_moments, with_tool
     from calib.commands.options import gravity_model
     from calib.records.store import RecordStore, way_to
 
@@ -70,8 +72,10 @@ def _model(
         raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
     if stated.placed is not None and (arm_file is None or record is None):
         source = arm if arm_file is None or stated.path is None else stated.path.name
-        return stated.arm, stated.placed.arm.beta, f"inertials of {source}"
+        carried = parse_tool(tool) if tool is not None else None if arm_file is None else arm_file.tool
+        return stated.arm, stated.placed.arm.beta + tool_moments(stated.arm, carried), f"inertials of {source}"
     assert arm_file is not None  # a model file is placed
+    arm_file = with_tool(arm_file, tool)
     found = gravity_model(arm_file, record, RecordStore(store))
     if found is None:
         raise Refused(

@@ -57,7 +57,8 @@ class FieldProblem:
         n, blank = self.arm.n, per_joint([UNCALIBRATED] * self.arm.n)
         if not rows.counted.any():
             raise BadInput("no torque reading can be used")
-        values, vectors = np.linalg.eigh(np.array(gravity.require(arm_file).covariance))
+        gravity = gravity.carrying(arm_file)
+        values, vectors = np.linalg.eigh(np.array(gravity.covariance))
         unknown = UNKNOWN_MOMENT * np.eye(2 * n)[:, ~np.array(gravity.identifiable)]
         self._root = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), unknown])
         self.sensors = Parameters.nominal(n, beta=np.array(gravity.beta))
