@@ -234,6 +234,19 @@ class LinkSection(Section):
         return self
 
 
+class Tool(Section):
+    """What the arm carries at its end: a gripper, a hand, a payload. An exchange needs no new calibration."""
+
+    mass: Positive
+    """[kg]"""
+    centre: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+    """Centre of mass in the frame that turns with the last joint, origin on its axis, z along it, x along `a` [m]."""
+    mass_std: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    """Standard deviation of the mass [kg]."""
+    centre_std: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    """Standard deviation of each coordinate of the centre [m]."""
+
+
 def is_serial(text: str) -> bool:
     """Whether a serial number is one, and not what stands in an arm file before anybody has given one."""
     return text.strip().casefold() not in ("", "unknown", "fill-in")
@@ -246,6 +259,7 @@ class ArmFile(Section):
     serial: Name = "unknown"
     kinematics: Kinematics
     link: LinkSection | None = None
+    tool: Tool | None = None
     sweep: Any = None
     sim: Any = None
     daemon: Any = None

@@ -210,7 +210,7 @@ def observe(
     if run.n != len(names):
         raise BadInput(f"observe: the recording has {run.n} joints, but {arm_file.name} has {len(names)}")
     calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepFit) else sensors.require(arm_file)
-    model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.require(arm_file)
+    model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.carrying(arm_file)
     rated = arm_file.require_link().rated_torques
     observer = observer_of(gcomp_arm(arm_file), calibration, model, rated, config)
     events: list[Event] = []

@@ -24,13 +24,16 @@ def load_recording(path: str | Path, stated: Corrections | None = None) -> Recor
     return next(iter(found.values()))
 
 
-def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict[str, Recording]:
-    """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set."""
+def load_recordings(path: str | Path, stated: Corrections | None = None, poses: bool = False) -> dict[str, Recording]:
+    """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set.
+
+    `poses`: a CSV table without times is one of poses.
+    """
     stated = stated or AS_IT_IS
     folder, _, episode = str(path).rpartition("#")
     place = Path(folder) if episode.isdigit() and folder else Path(path)
     with memory_budget(place):
-        found = _loaded(place, stated)
+        found = _loaded(place, stated, poses)
     if episode.isdigit() and folder:
         if str(path) not in found:
             raise BadInput(f"{path}: no such episode: {folder} has {len(found)}, counted from 0")
@@ -38,7 +41,7 @@ def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict
     return {label: stated.apply(_chosen(r, stated, label), label).check(label) for label, r in found.items()}
 
 
-def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
+def _loaded(path: Path, stated: Corrections, poses: bool = False) -> dict[str, Recording]:
     """The recordings of a path as they stand in it, but for their columns' names."""
     if (path / "meta" / "info.json").is_file():
         require_extra(str(path), "parquet")
@@ -76,7 +79,7 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
         return {str(path): load_parquet(path, stated.columns)}
     from armlink.recording.tables import load_csv
 
-    return {str(path): load_csv(path, stated.columns, stated.header)}
+    return {str(path): load_csv(path, stated.columns, stated.header, poses)}
 
 
 def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:

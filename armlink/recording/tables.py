@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
@@ -32,21 +34,29 @@ _MOST_RATIO, _SURELY_MUCH = 200, 1 << 28
 """A file that unpacks to more than _SURELY_MUCH bytes must not be smaller than this share of them."""
 
 
-def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({}), stated: tuple[str, ...] = ()) -> Recording:
+def load_csv(
+    path: Path,
+    columns: Mapping[str, str] = MappingProxyType({}),
+    stated: tuple[str, ...] = (),
+    poses: bool = False,
+) -> Recording:
     """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput.
 
     `columns`: column of docs/formats.md → the file's name for it. `stated`: names of the columns of a file without a
-    header row; empty for one to leave out.
+    header row; empty for one to leave out. `poses`: a table without times is one of poses, numbered by the second.
     """
     _require_header(path)
     content, cut, layout = _content(path, stated)
     require_each_once(layout.header, path)
     require_width(layout.header, str(path))
-    header = renamed_header(list(layout.header), columns, path)
+    timeless = poses and not {"t", columns.get("t", "t")} & set(layout.header)
+    header = renamed_header([*layout.header, *["t"] * timeless], columns, path)[: len(layout.header)]
     wanted = [column for column in header if is_channel(column)]
     require_size(8 * len(wanted) * content.count(b"\n"), str(path))
     places = {column: header.index(column) for column in wanted}
     arrays = read_numbers(content, layout, places, str(path))
+    if timeless:
+        header, arrays = [*header, "t"], {**arrays, "t": np.arange(len(next(iter(arrays.values()))), dtype=float)}
     loaded = recording_of_columns(arrays, header, str(path), names_of_columns(columns, header))
     if cut:
         cut = f"cut recording ({cut}): the first {loaded.t.size} rows were loaded"

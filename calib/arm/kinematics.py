@@ -7,6 +7,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
+from calib.arm.tool import tool_moments
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm, PlacedChain, place_chain
 from gcomp.arrays import Array
@@ -38,7 +39,9 @@ def gcomp_arm(arm_file: ArmFile) -> Arm:
 
 
 def model_arm(arm_file: ArmFile) -> ModelArm:
-    """The arm of the arm file's model file, with the model's own mass moments; raises BadInput as gcomp_arm does.
+    """The arm of the arm file's model file, with the mass moments of the model and the arm file's tool.
+
+    Raises BadInput as gcomp_arm does.
 
     The arm file's gravity is in the model's world frame; without it the model's own is used.
     """
@@ -48,7 +51,10 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
             f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the chain of the model is "
             f"{list(model.arm.names)}: give link.joints the same names in the same order"
         )
-    return replace(model, arm=_with_stops(arm_file, model.arm)) if kinematics.stops else model
+    arm = _with_stops(arm_file, model.arm) if kinematics.stops else model.arm
+    tool = 0.0 if arm_file.tool is None else arm_file.tool.mass
+    mass = model.mass + np.append(np.zeros(arm.n - 1), tool)
+    return replace(model, arm=arm, beta=model.beta + tool_moments(arm, arm_file.tool), mass=mass)
 
 
 def model_chain(arm_file: ArmFile) -> PlacedChain:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import JsonFile, Store, WithoutAsking
+from calib.commands.options import JsonFile, Store, Tool, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -21,6 +21,7 @@ def hold_afloat(
         str | None,
         typer.Option(help="Id of a gravity record; by default the current one, or else the inertials of the model."),
     ] = None,
+    tool: Tool = None,
     store: Store = None,
     yes: WithoutAsking = False,
     json_file: JsonFile = None,
@@ -39,15 +40,16 @@ def hold_afloat(
     from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
+    from calib.arm.tool import with_tool
     from calib.commands.screen import confirm, warn_late
     from calib.floating.run import run_float
 
-    arm_file = load_arm(arm)
+    arm_file = with_tool(load_arm(arm), tool)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
     if not yes:
         confirm(f"{arm_file.name} will be held by its gravity model alone. Do you hold it with your hand?")
-    resume = command_line("float", arm, bus=bus, record=record, store=store)
+    resume = command_line("float", arm, bus=bus, record=record, tool=tool, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
         work.enabled = True

@@ -1,29 +1,76 @@
-"""Identifies gravity parameters from sweeps, recursively from tip to base, then globally; keeps a gravity record."""
+"""Identifies gravity parameters from sweeps, or from poses of any robot; keeps a gravity record."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.commands.options import JsonFile, Store, Sweeps, SweepsArm
+from armlink.commands.options import reads_recordings
+from calib.commands.options import JsonFile, Store, SweepsArm
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
+    from armlink.recording.corrections import Corrections
     from calib.fit.gravity_fit import GravityFit
 
+POSES = "Poses of any robot, with --model"
 
+
+@reads_recordings
 def identify(
-    directories: Sweeps,
+    data: Annotated[
+        list[Path],
+        typer.Argument(help="Data sets of sweep; with --model recordings or tables of poses: CSV, bag, LeRobot."),
+    ],
+    stated: "Corrections",
     arm: SweepsArm = None,
     calibration: Annotated[
         str | None,
         typer.Option(help="Id of the calibration record to use; by default sensors are fitted from the same sweeps."),
     ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="URDF, MJCF or arm file of the recorded robot.", rich_help_panel=POSES)
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Body of the model file that carries the chain.", rich_help_panel=POSES)
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="Last body of the chain in the model file.", rich_help_panel=POSES)
+    ] = None,
+    reference_mass: Annotated[
+        list[str] | None,
+        typer.Option(help="Known mass that hung at the tip in one of the files: FILE=KG.", rich_help_panel=POSES),
+    ] = None,
+    heldout: Annotated[
+        list[Path] | None,
+        typer.Option(help="Poses to judge by; by default cross-validation.", rich_help_panel=POSES),
+    ] = None,
+    gain_std: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Standard deviation of the torque gains about 1; by default 0.03 of sensors, 0.5 of motor currents.",
+            rich_help_panel=POSES,
+        ),
+    ] = None,
+    out_model: Annotated[
+        Path | None, typer.Option(help="Also write the model with these moments: .urdf or .xml.", rich_help_panel=POSES)
+    ] = None,
+    coefficients: Annotated[
+        Path | None, typer.Option(help="Also write base parameters as YAML for ROS 2.", rich_help_panel=POSES)
+    ] = None,
+    plan: Annotated[
+        int, typer.Option(min=0, max=100, help="Also name so many further poses.", rich_help_panel=POSES)
+    ] = 0,
     store: Store = None,
     json_file: JsonFile = None,
-) -> None:
+) -> int:
     """Identify the mass moments that gravity compensation needs, and store them as a gravity record.
 
-    Example: armlink identify unloaded loaded --json gravity.json
+    From sweeps, or with --model from poses at rest or in slow motion of any robot, whatever it is connected by.
+    Exit status 1 if held-out poses are predicted worse than by the model's own inertials.
+
+    Example: armlink identify poses.csv --model arm.urdf --out-model better.urdf
     """
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
@@ -34,29 +81,49 @@ def identify(
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
 
-    data, arm_file = load_sweeps("identify", directories, arm)
     records = RecordStore(store)
+    of_poses = {
+        "base": base,
+        "tip": tip,
+        "reference_mass": reference_mass or [],
+        "heldout": heldout or [],
+        "gain_std": gain_std,
+        "out_model": out_model,
+        "coefficients": coefficients,
+        "plan": plan,
+    }
+    if model is not None:
+        if arm is not None or calibration is not None:
+            raise BadInput("--arm, --calibration: only for sweeps; poses need --model alone")
+        from calib.commands.identify_poses import identify_poses
+
+        return identify_poses(data, model, **of_poses, stated=stated, store=records, json_file=json_file)  # type: ignore[arg-type]
+    for name, value in of_poses.items():
+        if value is not None and (value or name == "gain_std"):
+            raise BadInput(f"--{name.replace('_', '-')}: only for poses: give the robot's model with --model")
+    sweeps, arm_file = load_sweeps("identify", data, arm)
     sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None
     if calibration is None:
-        sensors = calibrated(arm_file, data)
+        sensors = calibrated(arm_file, sweeps)
         current = records.current(CalibrationRecord, arm_file)
         used = current if current is not None and current.sources == sensors.sources else None
     else:
-        if all_creep(data):
+        if all_creep(sweeps):
             raise BadInput("--calibration: creep sweeps give drives and gravity in one fit: leave this option out")
         kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
             raise BadInput(f"--calibration {calibration}: this is a {kept.kind} record, expected a calibration record")
         sensors = used = kept
-    fit = identified(arm_file, data, sensors)
+    fit = identified(arm_file, sweeps, sensors)
     record = fit.record(arm_file, used)
-    records.put(record, arm_file, by="armlink identify", reason="creep sweeps" if all_creep(data) else "sweeps")
+    records.put(record, arm_file, by="armlink identify", reason="creep sweeps" if all_creep(sweeps) else "sweeps")
     out = results(json_file)
     _show(fit, out)
     out.print(f"record {record.id} is current: {fit.identifiable.sum()} of {len(fit.beta)} mass moments are determined")
     suggest(command_line("verify", arm_file.argument, store=store))
     write_json(json_file, _answer(fit, record.id))
+    return 0
 
 
 def _answer(fit: "GravityFit", record: str) -> dict[str, Any]:

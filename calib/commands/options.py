@@ -70,6 +70,17 @@ JsonFile = Annotated[
 ]
 
 
+Tool = Annotated[
+    str | None,
+    typer.Option(
+        "--tool",
+        metavar="MASS,X,Y,Z",
+        help="Tool that the arm carries: mass [kg] and its centre [m] in the frame that turns with the last joint; 0 "
+        "for none. By default the arm file's.",
+    ),
+]
+
+
 def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore") -> "tuple[Array, str] | None":
     """Mass moments (2n,) [kg·m] of the record named, else of the current one, and their origin; None without one.
 
@@ -85,7 +96,7 @@ def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore
         return None
     if not isinstance(kept, GravityRecord):
         raise BadInput(f"--record {record}: this is a {kept.kind} record, expected a gravity record")
-    return np.array(kept.beta), f"gravity record {kept.id}"
+    return np.array(kept.carrying(arm_file).beta), f"gravity record {kept.id}"
 
 
 def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":

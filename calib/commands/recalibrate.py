@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from armlink.commands.options import Arm
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store, Tool
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -34,12 +34,14 @@ def recalibrate(
     check: Check = True,
     flash: Flash = False,
     replaced: Replaced = None,
+    tool: Tool = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
     """Find gains and offsets from the current gravity record, and store them; --apply also makes them current.
 
-    The arm must carry nothing, and every joint must move slowly (below 0.1 rad/s), in both directions, or rest.
+    The arm must carry no more than its tool; every joint must move slowly (below 0.1 rad/s), in both directions, or
+    rest.
 
     Example: armlink recalibrate sarcos slow.mcap --json -
     """
@@ -47,11 +49,12 @@ def recalibrate(
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
+    from calib.arm.tool import with_tool
     from calib.fit.field_fit import fit_field
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore, no_record
 
-    arm_file, records = load_arm(arm), RecordStore(store)
+    arm_file, records = with_tool(load_arm(arm), tool), RecordStore(store)
     gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
     if gravity is None:
         raise no_record(arm_file, "gravity")
@@ -60,7 +63,7 @@ def recalibrate(
     record = fit.record(arm_file, before)
     out = results(json_file)
     _show(fit, out)
-    given = {"held": None if held == "record" else held, "bus": bus, "store": store}
+    given = {"held": None if held == "record" else held, "bus": bus, "tool": tool, "store": store}
     apply_it = command_line("recalibrate", arm, *map(str, data), "--apply", **given)
     if apply:
         import numpy as np
@@ -77,7 +80,9 @@ def recalibrate(
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
         with early_end(arm_file, apply_it) as work:
             work.enabled = check
-            written = apply_record(record, arm_file, records, how, np.array(gravity.beta), "slow motion")
+            written = apply_record(
+                record, arm_file, records, how, np.array(gravity.carrying(arm_file).beta), "slow motion"
+            )
         out.print(f"record {record.id} is current; it was written to {len(written)} drives and read back")
     else:
         records.add(record)
@@ -99,7 +104,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.dataset import labels, load_data
-    from calib.fit.field_fit import rows_of_recording, rows_of_sweeps
+    from calib.fit.slow_windows import rows_of_recording, rows_of_sweeps
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)

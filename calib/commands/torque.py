@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.commands.options import JsonFile, Store
+from calib.commands.options import JsonFile, Store, Tool
 
 if TYPE_CHECKING:
     from gcomp.arm.arm import Arm
@@ -25,6 +25,7 @@ def torque(
         str | None,
         typer.Option(help="Id of a gravity record; by default the inertials of the model, or else the current record."),
     ] = None,
+    tool: Tool = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -40,7 +41,7 @@ def torque(
     from calib.commands.poses_csv import load_poses
     from gcomp.gravity.torque import gravity_torque
 
-    described, beta, source = _model(arm, base, tip, record, store)
+    described, beta, source = _model(arm, base, tip, record, tool, store)
     poses = load_poses(q, described.n)
     answer = gravity_torque(described, beta, poses)
     table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
@@ -56,35 +57,29 @@ def torque(
 
 
 def _model(
-    arm: str, base: str | None, tip: str | None, record: str | None, store: str | None
+    arm: str, base: str | None, tip: str | None, record: str | None, tool: str | None, store: str | None
 ) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
-    from armlink.arm_file import MODEL_SUFFIXES, load_arm
-    from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
-    from calib.arm.kinematics import gcomp_arm, model_arm
+    from calib.arm.stated_model import stated_model
+    from calib.arm.tool import parse_tool, tool_moments, with_tool
     from calib.commands.options import gravity_model
     from calib.records.store import RecordStore, way_to
-    from gcomp.arm.load import load_model
 
-    if Path(arm).suffix.lower() in MODEL_SUFFIXES:
-        if record is not None:
-            raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
-        if not Path(arm).is_file():
-            raise BadInput(f"there is no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
-        with model_budget(Path(arm)):
-            model = load_model(Path(arm), base=base, tip=tip)
-        return model.arm, model.beta, f"inertials of {arm}"
-    if base is not None or tip is not None:
-        raise BadInput("--base, --tip: only for a URDF or MJCF file; an arm file describes its chain under kinematics")
-    arm_file = load_arm(arm)
-    if record is None and arm_file.model_path is not None:
-        model = model_arm(arm_file)
-        return model.arm, model.beta, f"inertials of {arm_file.model_path.name}"
+    stated = stated_model(arm, base, tip)
+    arm_file = stated.arm_file
+    if arm_file is None and record is not None:
+        raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
+    if stated.placed is not None and (arm_file is None or record is None):
+        source = arm if arm_file is None or stated.path is None else stated.path.name
+        carried = parse_tool(tool) if tool is not None else None if arm_file is None else arm_file.tool
+        return stated.arm, stated.placed.arm.beta + tool_moments(stated.arm, carried), f"inertials of {source}"
+    assert arm_file is not None  # a model file is placed
+    arm_file = with_tool(arm_file, tool)
     found = gravity_model(arm_file, record, RecordStore(store))
     if found is None:
         raise Refused(
             f"{arm_file.name} {arm_file.serial}: its model has no inertials, and there is no gravity record "
             f"yet: {way_to(arm_file, 'gravity')}"
         )
-    return gcomp_arm(arm_file), *found
+    return stated.arm, *found

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import JsonFile, KeepGoing, Store, WithoutAsking
+from calib.commands.options import JsonFile, KeepGoing, Store, Tool, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
@@ -20,6 +20,7 @@ def verify(
     record: Annotated[
         list[str] | None, typer.Option(help="Id of a gravity or calibration record; by default the current records.")
     ] = None,
+    tool: Tool = None,
     store: Store = None,
     poses: Annotated[int, typer.Option(min=1, help="Number of poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random poses.")] = 0,
@@ -41,17 +42,18 @@ def verify(
     from armlink.extras import require_extra
     from armlink.loop.open import open_arm
     from calib.arm.sweep_section import sweep_motion
+    from calib.arm.tool import with_tool
     from calib.commands.screen import SweepScreen, confirm
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
     if report is not None:
         require_extra("--report", "reports")
-    arm_file = load_arm(arm)
+    arm_file = with_tool(load_arm(arm), tool)
     if not yes:
         confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is its space clear?")
     with (
-        early_end(arm_file, command_line("verify", arm, bus=bus, store=store)) as work,
+        early_end(arm_file, command_line("verify", arm, bus=bus, tool=tool, store=store)) as work,
         open_arm(arm_file, bus) as link,
     ):
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])

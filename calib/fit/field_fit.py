@@ -3,8 +3,6 @@
 v_i = K_i τ_i(q; β) + O_i + s_i f_i, with s_i the side of approach and f_i hysteresis or friction that the sensor sees;
 β ~ N(β̂, Cov β̂) from the gravity record and position offsets with their standard deviations, all joints in one problem
 (docs/theory.md, section 4.3). The intervals include the gravity record's own error, which does not average out.
-
-Its rows are slow windows of a recording, or the unloaded readings of sweeps.
 """
 
 from collections.abc import Sequence
@@ -14,16 +12,14 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from armlink.recording.recording import Recording
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.dataset import SweepData
 from calib.fit.calibration import LOOSEST_GAIN, NOISE_ROUNDS, VERY_STRONG_EVIDENCE, FittedCalibration
 from calib.fit.creep_residuals import inflation
 from calib.fit.heldout import held_out
 from calib.fit.small_troubles import PositionField
-from calib.fit.sweep_readings import FEWEST, sweep_readings
+from calib.fit.sweep_readings import FEWEST
 from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
@@ -59,7 +55,8 @@ class FieldProblem:
         n, blank = self.arm.n, per_joint([UNCALIBRATED] * self.arm.n)
         if not rows.counted.any():
             raise BadInput("no torque reading can be used")
-        values, vectors = np.linalg.eigh(np.array(gravity.require(arm_file).covariance))
+        gravity = gravity.carrying(arm_file)
+        values, vectors = np.linalg.eigh(np.array(gravity.covariance))
         unknown = UNKNOWN_MOMENT * np.eye(2 * n)[:, ~np.array(gravity.identifiable)]
         self._root = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), unknown])
         self.sensors = Parameters.nominal(n, beta=np.array(gravity.beta))
@@ -304,107 +301,3 @@ def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecor
             line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
             new[test, j] = rows.torque[test, j] - np.polyval(line, fit.torque[test, j])
     return new, old
-
-
-WINDOW = 0.25
-"""Length of a window, which is averaged to one row [s]."""
-FEWEST_SAMPLES = 3
-"""Samples of a window; its slope and scatter need as many."""
-SLOW = 0.1
-"""Largest speed of any joint in a window that counts: centrifugal torque is then below 0.1 N·m at 10 kg·m² [rad/s]."""
-STEADY = 0.05
-"""Largest change of any joint's speed [rad/s²] (docs/theory.md, section 6.1)."""
-MOVED = 0.004
-"""Motion of a joint after which its direction counts as changed [rad]."""
-FEWEST_ROWS = 12
-"""Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
-
-
-def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:
-    """Windows of a recording in which all joints move slowly and steadily.
-
-    `held` (n,) is what the controllers held: what they sent is turned back into the sensors' own readings. Raises
-    BadInput if there is no joint torque, or nothing slow enough.
-    """
-    if recording.torque is None:
-        raise BadInput(
-            f"{source}: there is no joint torque (columns tau_1 …), but calibration needs the readings of the "
-            "torque sensors"
-        )
-    keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
-    t, position = recording.t[keep], recording.position[keep]
-    torque = held.apply(recording.torque[keep])
-    windows = _windows(t)
-    if not windows:
-        raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
-    slopes = np.array([_slope(t[each], position[each]) for each in windows])
-    middles = np.array([t[each].mean() for each in windows])
-    change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
-    padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, recording.n))
-    steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
-    slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
-    if slow.sum() < FEWEST_ROWS:
-        raise BadInput(
-            f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are "
-            f"needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} rad/s"
-        )
-    means = np.array([position[each].mean(axis=0) for each in windows])
-    chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
-    sigma = np.array([_scatter_about_line(t[each], torque[each]) / np.sqrt(len(t[each])) for each in chosen])
-    typical = np.sqrt(np.median(sigma**2, axis=0))
-    return StaticReadings(
-        means[slow],
-        np.array([torque[each].mean(axis=0) for each in chosen]),
-        np.maximum(typical, 1e-6),
-        direction=_directions(means)[slow],
-        series=np.full(len(chosen), number),
-    )
-
-
-def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
-    """The readings of a sweep at rest; raises BadInput for creep sweeps, and if a reference mass was attached."""
-    if data.creeps:
-        raise BadInput(f"{data.path}: creep sweeps: they belong to armlink calibrate {data.path}")
-    if data.manifest.reference_mass > 0:
-        raise BadInput(
-            f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the field "
-            f"calibration needs the arm without a mass; sweeps with a mass are for armlink calibrate {data.path}"
-        )
-    readings = sweep_readings([data]).readings
-    return replace(readings, series=np.full(len(readings), number))
-
-
-def _windows(t: Array) -> list[slice]:
-    windows, begin = [], 0
-    while begin < len(t):
-        end = int(np.searchsorted(t, t[begin] + WINDOW))
-        if end - begin >= FEWEST_SAMPLES and t[end - 1] - t[begin] >= WINDOW / 2:
-            windows.append(slice(begin, end))
-        begin = max(end, begin + 1)
-    return windows
-
-
-def _slope(t: Array, values: Array) -> Array:
-    """Mean rate of change (n,) by least squares."""
-    time = t - t.mean()
-    slope: Array = time @ (values - values.mean(axis=0)) / (time @ time)
-    return slope
-
-
-def _scatter_about_line(t: Array, values: Array) -> Array:
-    """Standard deviation (n,) about a straight line."""
-    line = np.outer(t - t.mean(), _slope(t, values)) + values.mean(axis=0)
-    scatter: Array = np.sqrt(((values - line) ** 2).sum(axis=0) / max(len(t) - 2, 1))
-    return scatter
-
-
-def _directions(positions: Array) -> Array:
-    """Sign of each joint's last motion of at least MOVED, row by row (K, n)."""
-    direction, now = np.zeros_like(positions), np.zeros(positions.shape[1])
-    anchor = positions[0].copy()
-    for row, here in enumerate(positions):
-        moved = np.abs(here - anchor) > MOVED
-        now = np.where(moved, np.sign(here - anchor), now)
-        anchor = np.where(moved, here, anchor)
-        direction[row] = now
-    return direction

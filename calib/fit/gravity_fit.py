@@ -54,6 +54,7 @@ class GravityFit:
             identifiable=tuple(bool(found) for found in self.identifiable),
             gravity=tuple(gcomp_arm(arm_file).gravity.tolist()),
             calibration=None if calibration is None else calibration.id,
+            tool=arm_file.tool,
         )
 
 

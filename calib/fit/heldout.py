@@ -56,7 +56,7 @@ def held_out_steps(
         return HeldOut(against=old.id)
     rows = sweep_readings([each.require(arm) for each in data])
     independent = gravity is not None and not gravity.is_fitted_to(digests)
-    beta = np.array(gravity.require(arm).beta) if gravity is not None and independent else None
+    beta = np.array(gravity.carrying(arm).beta) if gravity is not None and independent else None
     fresh = heldout_scores(new, arm, rows, refit=True)
     return held_out(old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
 

@@ -89,7 +89,7 @@ def apply_rollback(
     Its only gate is the distance from what the controllers hold. Raises Refused, BusFault.
     """
     gravity = store.current(GravityRecord, arm)
-    beta = None if gravity is None else np.array(gravity.beta)
+    beta = None if gravity is None else np.array(gravity.carrying(arm).beta)
 
     def gate(link: ArmDriver) -> Admitted:
         held = {joint: link.read_calibration(joint) for joint in range(link.n)}

@@ -52,7 +52,7 @@ class AfterWrite:
         new: Mapping[int, TorqueCalibration[float]],
     ) -> None:
         """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
-        self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)
+        self._arm, self._beta = gcomp_arm(arm), np.array(gravity.carrying(arm).beta)
         self._record = record
         config = ObserverConfig()
         self._rests = RestDetector(len(record.joints), config)

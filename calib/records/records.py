@@ -19,11 +19,13 @@ from pydantic import (
     model_validator,
 )
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, Tool
 from armlink.content.yaml_text import yaml_document
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.tool import tool_covariance, tool_moments
 from gcomp.arrays import Array
 
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
@@ -269,6 +271,19 @@ class GravityRecord(ArmRecord):
     """Acceleration of gravity used, base frame [m/s²]; the scale of β depends on it."""
     calibration: str | None = None
     """Id of the calibration record whose sensors measured it."""
+    tool: Annotated[Tool | None, Field(exclude_if=lambda value: value is None)] = None
+    """The tool that the arm carried then, as its arm file had it; its moments are in β."""
+
+    def carrying(self, arm: ArmFile) -> "GravityRecord":
+        """This record with the tool that the arm carries now in place of the one of then; raises Refused as require."""
+        self.require(arm)
+        if self.tool == arm.tool:
+            return self
+        kinematics = gcomp_arm(arm)
+        beta = np.array(self.beta) - tool_moments(kinematics, self.tool) + tool_moments(kinematics, arm.tool)
+        doubt = tool_covariance(kinematics, self.tool) + tool_covariance(kinematics, arm.tool)
+        covariance = matrix(np.array(self.covariance) + doubt)
+        return self.model_copy(update={"beta": tuple(beta.tolist()), "covariance": covariance, "tool": arm.tool})
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> Self:

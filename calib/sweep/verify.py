@@ -115,7 +115,8 @@ def run_verify(
         raise BadInput(f"{arm_file.name}: its drives store no calibration, so verify needs a calibration record")
     installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
     wanted = installed if calibration is None else calibration.torque_calibration(installed)
-    beta = np.array(gravity.require(arm_file).beta)
+    gravity = gravity.carrying(arm_file)
+    beta = np.array(gravity.beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
     read_at: ReadAt

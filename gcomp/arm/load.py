@@ -72,6 +72,8 @@ class PlacedChain:
     """Joint positions (n,) of this configuration [rad]."""
     bodies: tuple[tuple[int, ...], ...]
     """Ids of the bodies that each link consists of, the one with the joint first."""
+    joints: tuple[int, ...]
+    """Ids of the chain's joints."""
 
 
 def place_chain(
@@ -93,6 +95,11 @@ def compile_model(path: Path) -> "mujoco.MjModel":
 
     Gravity needs the inertials alone.
     """
+    return compiled_spec(path)[1]
+
+
+def compiled_spec(path: Path) -> "tuple[mujoco.MjSpec, mujoco.MjModel]":
+    """The same with its specification, in which files have absolute paths."""
     import mujoco
 
     mujoco.set_mju_user_warning(log.info)
@@ -102,10 +109,13 @@ def compile_model(path: Path) -> "mujoco.MjModel":
         raise BadModel(f"{path}: not a URDF or MJCF file: {error}") from None
     try:
         if root.tag == "robot":
-            return mujoco.MjModel.from_xml_string(_plain_urdf(root))
-        spec = mujoco.MjSpec.from_file(str(path))
-        _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
-        return spec.compile()
+            spec = mujoco.MjSpec.from_string(_plain_urdf(root))
+        else:
+            spec = mujoco.MjSpec.from_file(str(path))
+            _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
+            for key in ("meshdir", "texturedir"):
+                setattr(spec.compiler, key, str((path.parent / getattr(spec.compiler, key)).resolve()))
+        return spec, spec.compile()
     except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
         raise BadModel(f"{path}: MuJoCo refuses this file: {' '.join(str(error).split())}") from None
 
@@ -253,7 +263,9 @@ def _place(
         first_moment[link] += model.body_mass[body] * geometry.bar[link].T @ (data.xipos[body] - geometry.origins[link])
         bodies[link].append(body)
     arm = ModelArm(geometry.arm, base_parameters(geometry.arm, mass, first_moment), mass)
-    return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
+    return PlacedChain(
+        model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)), tuple(chain)
+    )
 
 
 def _refuse_what_is_no_number(values: Mapping[str, ArrayLike], path: Path) -> None:
@@ -282,7 +294,7 @@ def joint_inertias(placed: PlacedChain, poses: Array, mass: float = 0.0) -> Arra
     import mujoco
 
     model, data = placed.model, placed.data
-    chain = [model.joint(name).id for name in placed.arm.arm.names]
+    chain = list(placed.joints)
     places, rates = model.jnt_qposadr[chain], model.jnt_dofadr[chain]
     column, found = np.zeros(model.nv), np.empty(poses.shape)
     before = data.qpos.copy()
@@ -295,4 +307,24 @@ def joint_inertias(placed: PlacedChain, poses: Array, mass: float = 0.0) -> Arra
             found[row, joint] = column[rate] + mass * (levers[joint] ** 2).sum()
     data.qpos[:] = before
     mujoco.mj_fwdPosition(model, data)
+    return found
+
+
+def inertial_torque(placed: PlacedChain, q: Array, velocity: Array, acceleration: Array) -> Array:
+    """Torque of the model's links beyond gravity (K, n) [N·m] in a motion; (K, n) [rad], [rad/s], [rad/s²]."""
+    import mujoco
+
+    model, data = placed.model, mujoco.MjData(placed.model)
+    data.qpos[:] = placed.data.qpos
+    chain = list(placed.joints)
+    places, rates = model.jnt_qposadr[chain], model.jnt_dofadr[chain]
+    found, both = np.empty(q.shape), np.zeros((2, model.nv))
+    for row in range(len(q)):
+        data.qpos[places] = q[row]
+        for part, share in zip(both, (1.0, 0.0), strict=True):
+            data.qvel[rates], data.qacc[rates] = share * velocity[row], share * acceleration[row]
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_comVel(model, data)
+            mujoco.mj_rne(model, data, 1, part)
+        found[row] = (both[0] - both[1])[rates]
     return found

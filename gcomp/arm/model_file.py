@@ -5,6 +5,10 @@ import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
 from xml.parsers import expat
 
+import numpy as np
+
+from gcomp.arrays import Array
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -51,3 +55,8 @@ def coupled_joints(model: "mujoco.MjModel") -> dict[str, str]:
             first, second = (model.joint(int(each[equality])).name for each in (model.eq_obj1id, model.eq_obj2id))
             pairs |= {first: second, second: first}
     return pairs
+
+
+def linear_part(values: Array, count: int) -> Array:
+    """View of the linear coefficients (count,) of a MuJoCo field that may hold polynomials, such as `dof_damping`."""
+    return np.reshape(values, (count, -1))[:, 0]

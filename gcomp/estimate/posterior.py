@@ -10,9 +10,12 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from gcomp.arrays import Array
+from gcomp.estimate.problem import Index
 
 TRUST = {"initial_trust_radius": 100.0, "max_trust_radius": 1e4}
 """Length of a step [standard deviations of the prior]: most problems are nearly linear within all that is plausible."""
+MOST_STEPS = 200
+"""Steps, of which some ten are taken; where friction changes its sign the search may go to and fro about the end."""
 
 
 class ReadingModel(Protocol):
@@ -27,6 +30,33 @@ class ReadingModel(Protocol):
 
     def linearised(self, x: Array) -> tuple[Array, Array]:
         """(Expected (R,), derivatives (R, P))."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartialModel:
+    """A reading model of which some parameters (F,) are free; the others are known."""
+
+    whole: ReadingModel
+    known: Array
+    """All parameters (P,)."""
+    free: Index
+
+    @property
+    def reading(self) -> Array:
+        return self.whole.reading
+
+    def complete(self, x: Array) -> Array:
+        """All parameters (P,) for free ones (F,)."""
+        found = self.known.copy()
+        found[self.free] = x
+        return found
+
+    def predict(self, x: Array) -> Array:
+        return self.whole.predict(self.complete(x))
+
+    def linearised(self, x: Array) -> tuple[Array, Array]:
+        expected, jacobian = self.whole.linearised(self.complete(x))
+        return expected, jacobian[:, self.free]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +78,17 @@ class PosteriorFit:
 
 
 def most_probable(
-    model: ReadingModel, whiten: Callable[[Array], Array], mean: Array, std: Array, start: Array
+    model: ReadingModel,
+    whiten: Callable[[Array], Array],
+    mean: Array,
+    std: Array,
+    start: Array,
+    gradient: float = 1e-4,
 ) -> PosteriorFit:
     """Parameters with a prior of this mean and std (P,), by Gauss-Newton steps in a trust region.
 
-    `whiten` makes columns (R, …) such that the readings' errors have unit variance and nothing in common.
+    `whiten` makes columns (R, …) such that the readings' errors have unit variance and nothing in common. The end is at
+    most `gradient` posterior standard deviations from the maximum.
     """
     reading = model.reading
 
@@ -76,7 +112,12 @@ def most_probable(
 
     first = (start - mean) / std
     end = minimize(
-        cost, first, jac=lambda z: slopes_at(z)[1], hess=lambda z: slopes_at(z)[2], method="trust-exact", options=TRUST
+        cost,
+        first,
+        jac=lambda z: slopes_at(z)[1],
+        hess=lambda z: slopes_at(z)[2],
+        method="trust-exact",
+        options={**TRUST, "gtol": gradient, "maxiter": MOST_STEPS},
     )
     x = mean + std * end.x
     residual, _, information = slopes(x)

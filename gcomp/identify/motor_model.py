@@ -1,11 +1,12 @@
-"""The reading of a slowly moving joint whose torque is a current, and its derivatives (docs/theory.md, section 11).
+"""The reading of a joint, slow or at rest, whose torque is a current, and its derivatives (docs/theory.md, section 11).
 
     v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + c(q) + κ (q − q̄)) + o
 
 τ is the gravity torque of joint i at the angles q + zero − lag·q̇, with the reference mass where it hangs: torque is
-read a little later than the position; s is the direction. c is a line of ripple, of a given period; κ a spring's
-stiffness, which is 0 unless one is looked for. The product a·u is left out: a millinewton-metre or so, it would be all
-that tells a from the offset where torque keeps its sign, and no arm is as exact as that.
+read a little later than the position; s is the direction, at rest that of the last motion. c is a line of ripple, of a
+given period; κ a spring's stiffness, which is 0 unless one is looked for. The product a·u is left out: a
+millinewton-metre or so, it would be all that tells a from the offset where torque keeps its sign, and no arm is as
+exact as that.
 """
 
 from dataclasses import dataclass, replace
@@ -123,7 +124,7 @@ class MotorDoubt:
 
 
 class MotorModel:
-    """Readings of R rows, in each of which one joint moves, for given parameters."""
+    """The R readings that count, row by row and joint by joint, for given parameters."""
 
     def __init__(self, arm: Arm, readings: StaticReadings, ripple: Array | None = None) -> None:
         """`ripple` (n,) are the periods in a turn of each joint's ripple, 0 where there is none."""
@@ -133,6 +134,8 @@ class MotorModel:
         self._each, self.joint = np.nonzero(readings.counted)
         self.reading = readings.torque[self._each, self.joint]
         self.velocity = readings.velocity[self._each, self.joint]
+        last = readings.direction[self._each, self.joint]
+        self._side = np.where(last == 0, np.sign(self.velocity), last)
         self._warmth = readings.warmth[self._each, self.joint]
         own = readings.position[self._each, self.joint]
         self._waves = np.stack([f(k * own) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)], axis=1)
@@ -164,7 +167,7 @@ class MotorModel:
         of = {
             family: x[place][self.joint] for family, place in self.slices.items() if place.stop - place.start == self.n
         }
-        side = np.sign(self.velocity)
+        side = self._side
         motor = torque + (side + of["asymmetry"]) * (of["coulomb"] + of["load"] * np.abs(torque))
         motor += side * (self._waves * x[self.slices["uneven"]].reshape(self.n, -1)[self.joint]).sum(axis=1)
         motor += (self._ripple * x[self.slices["ripple"]].reshape(self.n, 2)[self.joint]).sum(axis=1)
@@ -173,7 +176,7 @@ class MotorModel:
 
     def linearised(self, x: Array) -> tuple[Array, Array]:
         """(Readings (R,), derivatives (R, P))."""
-        at, j, each, side = self.slices, self.joint, self._each, np.sign(self.velocity)
+        at, j, each, side = self.slices, self.joint, np.arange(len(self.joint)), self._side
         torque, by_sensor, _ = predict_and_jacobian(self.arm, *self._gravity(x))
         gain, scale, motor = self._motor(x, torque)
         coulomb, load, asymmetry = (x[at[name]][j] for name in ("coulomb", "load", "asymmetry"))
@@ -198,5 +201,5 @@ class MotorModel:
         sensor = sensor_slices(self.n)
         for family, name in (("beta", "beta"), ("rho", "rho"), ("zero", "position_offset")):
             jacobian[:, at[family]] = by_torque * by_sensor[:, sensor[name]]
-        jacobian[:, at["lag"].start] = -jacobian[each, at["zero"].start + j] * self.velocity
+        jacobian[:, at["lag"].start] = -(jacobian[:, at["zero"]] * self.readings.velocity[self._each]).sum(axis=1)
         return slope * motor + x[at["offset"]][j], jacobian

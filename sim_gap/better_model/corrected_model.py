@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from gcomp.arm.inertials import body_parameters, set_body, write_bodies
+from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import mount_matrix, pseudo_inertia
-from sim_gap.model.load import SimModel, linear_part, named_spec
-from sim_gap.model.rigid_body import inertial_of
+from sim_gap.model.load import SimModel, named_spec
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
-
-LEAST_SECOND_MOMENT = 1e-6
-"""Least second moment of mass along a principal axis [kg·m²]."""
 
 
 def add_motors(spec: Any, sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> None:
@@ -127,17 +125,6 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
     return set_body(model, body, anchor, total)
 
 
-def set_body(model: Any, body: int, anchor: Array, total: Array) -> bool:
-    """Give a body ten inertial parameters about a point of it, or the closest that can exist; whether it has them."""
-    mass, centre, about = mass_centre_inertia(total)
-    values, axes = np.linalg.eigh(about)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    possible = closest_possible(values)
-    model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass, anchor + centre, possible
-    mujoco_quaternion(model.body_iquat[body], axes)
-    return bool(np.allclose(possible, values, rtol=1e-3, atol=1e-9) and mass == total[0])
-
-
 def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
     """Bodies without a joint of their own among `joints` that are carried by this one without one in between."""
     moving = {int(model.jnt_bodyid[joint]) for joint in joints}
@@ -147,17 +134,6 @@ def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
         if other not in moving and (up == body or up in out):
             out.append(other)
     return out
-
-
-def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
-    """Ten parameters of a body about a point of its frame, in a frame turned by `turn`."""
-    import mujoco
-
-    spin = np.zeros(9)
-    mujoco.mju_quat2Mat(spin, model.body_iquat[body])
-    axes = turn @ spin.reshape(3, 3)
-    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
-    return inertial_of(float(model.body_mass[body]), turn @ (model.body_ipos[body] - origin), inertia)
 
 
 def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
@@ -170,12 +146,6 @@ def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
     turn = up.T @ own
     place = up.T @ (data.xpos[other] - data.xpos[body]) - anchor
     return body_parameters(model, other, -turn.T @ place, turn)
-
-
-def mujoco_quaternion(out: Array, axes: Array) -> None:
-    import mujoco
-
-    mujoco.mju_mat2Quat(out, axes.ravel())
 
 
 def may_exist(inertial: Array) -> bool:
@@ -218,16 +188,7 @@ def compiled_copy(spec: Any) -> Any:
 def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
     """Write what a copy of the compiled model has of the arm's joints and links into its file's specification: one way
     to a file for what torques and what positions have shown."""
-    nominal = sim.mujoco_model
-    fields = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_gravcomp")
-    changed = {
-        i for field in fields for i in np.argwhere(getattr(model, field) != getattr(nominal, field))[:, 0].tolist()
-    }
-    for body in spec.bodies:
-        if (i := body.id) in changed:
-            body.explicitinertial, body.fullinertia = True, [np.nan] * 6
-            body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
-            body.inertia, body.gravcomp = model.body_inertia[i], float(model.body_gravcomp[i])
+    write_bodies(spec, sim.mujoco_model, model)
     for number in sim.joints:
         joint, dof, adr = spec.joints[number], model.jnt_dofadr[number], model.jnt_qposadr[number]
         unit = float(np.degrees(1.0)) if joint.compiler.degree else 1.0
@@ -273,17 +234,3 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
         total = stiffness[joint] + c[0]
         model.qpos_spring[adr] = (stiffness[joint] * model.qpos_spring[adr] - c[1]) / total
         stiffness[joint] = total
-
-
-def closest_possible(principal: Array) -> Array:
-    """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
-    spread = np.maximum(0.5 * principal.sum() - principal, LEAST_SECOND_MOMENT)
-    return np.asarray(spread.sum() - spread)
-
-
-def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
-    """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
-    mass = max(float(inertial[0]), 1e-6)
-    centre = inertial[1:4] / mass
-    about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.content.atomic_file import write_whole, writing
+from calib.arm.urdf import URDF, urdf_of, xml_comment
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,
@@ -18,7 +19,6 @@ from sim_gap.better_model.corrected_model import (
 )
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
-from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
 from sim_gap.effects.torque import is_gradual
 from sim_gap.model.load import SimModel, urdf_behind
 from sim_gap.search.estimate import EffectEstimate

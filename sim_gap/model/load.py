@@ -10,10 +10,10 @@ import numpy as np
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
-from gcomp.arm.model_file import HAND, coupled_joints, upwards
-from gcomp.arrays import Array
+from gcomp.arm.inertials import inertial_of
+from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
 from sim_gap.model.known_gains import KnownGains, put_gains
-from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
+from sim_gap.model.rigid_body import RigidArm, Tendons
 from sim_gap.model.solver_friction import creep_speeds
 
 
@@ -212,11 +212,6 @@ def urdf_behind(path: Path | None) -> Path | None:
     """The URDF file that a model was read from, also by an arm file; None if it is of another kind."""
     source = nominal_model(path) if path is not None and is_arm_file(path) else path
     return source if isinstance(source, Path) and is_urdf(source) else None
-
-
-def linear_part(values: Array, count: int) -> Array:
-    """View of the linear coefficients (count,) of a MuJoCo field that may hold polynomials, such as `dof_damping`."""
-    return np.reshape(values, (count, -1))[:, 0]
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:

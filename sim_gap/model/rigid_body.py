@@ -236,12 +236,6 @@ def symmetric(six: Array) -> Array:
     return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
 
 
-def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
-    """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
-    about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])
-
-
 def torque_slopes(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> tuple[Array, Array, Array]:
     """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each.
 

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gcomp.arm.inertials import body_parameters, set_body
+from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array, Mask
-from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.better_model.native_drives import resting_command
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import point_mass
-from sim_gap.model.load import SimModel, linear_part
+from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import creep_speeds, solver_parameters
 from sim_gap.position_gap.parameters import PARAMETERS
 

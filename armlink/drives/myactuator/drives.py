@@ -351,6 +351,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     return found
 
 
-SEARCH = Discovery("model (B5h) of ids 1 to 32", find_drives, ("canopen", "damiao", "moteus", "odrive"))
+SEARCH = Discovery(find_drives, ("canopen", "damiao", "moteus", "odrive"))
 SUMMARY = "MyActuator RMD-X with V3 drives (protocol V3.4 to V4.2)"
 FAMILY = Family("myactuator", TRAITS, MyActuatorSettings, MyActuatorDrives, discovery=SEARCH, summary=SUMMARY)

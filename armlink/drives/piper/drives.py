@@ -241,6 +241,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-SEARCH = Discovery("frames of six joints heard, then the firmware", find_drives, ("odrive",))
+SEARCH = Discovery(find_drives, ("odrive",))
 SUMMARY = "AgileX Piper arms: read beside their own host, not driven"
 FAMILY = Family("piper", TRAITS, PiperSettings, PiperDrives, discovery=SEARCH, summary=SUMMARY)

@@ -126,7 +126,7 @@ class ActiveRecords:
             self.detail = waits
             return
         before = self.observation
-        if before is not None and before.feed.measures_against(calibration, gravity):
+        if before is not None and before.feed.measures_against(calibration, gravity, arm):
             self.detail = ""
             return
         self.observation = self._observe(calibration, gravity)

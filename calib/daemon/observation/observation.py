@@ -39,15 +39,17 @@ class ObserverFeed:
         """Raises Refused if a record is of another arm."""
         section = arm.require_link()
         described, self.gravity, self.calibration = gcomp_arm(arm), gravity.require(arm), calibration.require(arm)
+        self.carried = gravity.carrying(arm)
+        """The gravity record with the tool of now."""
         self.names = described.names
         rated = section.rated_torques
-        self.observer = observer_of(described, self.calibration, self.gravity, rated, config)
+        self.observer = observer_of(described, self.calibration, self.carried, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
         self._change = per_joint([UNCALIBRATED] * described.n)
         self._left: Samples | None = None
 
-    def measures_against(self, calibration: CalibrationRecord, gravity: GravityRecord) -> bool:
-        return (calibration.id, gravity.id) == (self.calibration.id, self.gravity.id)
+    def measures_against(self, calibration: CalibrationRecord, gravity: GravityRecord, arm: ArmFile) -> bool:
+        return (calibration.id, gravity.carrying(arm).id) == (self.calibration.id, self.carried.id)
 
     def install(self, record: CalibrationRecord, finding: DriftFinding) -> None:
         """A finding was written: `record`, which follows from the one before, is in force and in the controllers."""
@@ -135,7 +137,7 @@ class ObserverStorage:
         """Save the observer's state and, if asked for, a point of history: both or neither."""
         now, t = self._environment.wall(), self._environment.monotonic()
         with self._journal.transaction():
-            self._journal.save_belief(now, feed.calibration.id, feed.gravity.id, feed.observer.save())
+            self._journal.save_belief(now, feed.calibration.id, feed.carried.id, feed.observer.save())
             if history:
                 self._journal.add_history(now, t, feed.calibration.id, feed.point())
                 self._history_at = t
@@ -147,7 +149,7 @@ class ObserverStorage:
         It may also belong to the record before, if `installed`, a finding that the state lacks, led from there to here.
         """
         saved = self._journal.belief()
-        if saved is None or saved.gravity != feed.gravity.id:
+        if saved is None or saved.gravity != feed.carried.id:
             return
         if saved.calibration == feed.calibration.id:
             feed.observer.restore(saved.state)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from armlink.recording.recording import Recording
+from calib.arm.urdf import xml_comment
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import spec_of, write_changes
 from sim_gap.better_model.export import CorrectedText
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
-from sim_gap.better_model.urdf import xml_comment
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import id_of, present, without_group
 from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch

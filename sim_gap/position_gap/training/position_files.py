@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from armlink.errors import BadInput
+from calib.arm.urdf import URDF, xml_comment
 from gcomp.arrays import Array
 from sim_gap.better_model.export import module_path, module_text, write_files
 from sim_gap.better_model.training_files import Row, steps_of, write_entries, write_rows
-from sim_gap.better_model.urdf import URDF, xml_comment
 from sim_gap.position_gap.choice import present
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, effects_left_out, export_fit, native_fit

@@ -16,7 +16,8 @@ from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.field_fit import fit_field, rows_of_recording
+from calib.fit.field_fit import fit_field
+from calib.fit.slow_windows import rows_of_recording
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.mass_moments import payload_columns

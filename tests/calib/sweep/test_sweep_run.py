@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sweep_arms import at_rate, random_arm, with_section
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, Tool
 from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
@@ -215,3 +215,16 @@ def test_a_stop_that_is_not_where_the_arm_file_has_it_is_named(chain: Chain) -> 
         mover.press(np.array([0, 1, 0]), np.array([0.0, 5.0, 0.0]))
     mover.hold_all()
     mover.cycle()
+
+
+def test_a_tool_mounted_after_the_sweeps_is_declared_instead_of_swept_again(chain: Chain) -> None:
+    record = chain.fit.record(chain.arm)
+    gravity = identify_gravity(chain.arm, chain.data, chain.fit).record(chain.arm, record)
+    tool = Tool(mass=1.0, centre=tuple(chain.simulated.truth.attachment.tolist()))
+    chain.simulated.attach_mass(tool.mass)
+    try:
+        assert not run_verify(chain.link, chain.arm, gravity, record, poses=4, seed=2).passed
+        carrying = chain.arm.model_copy(update={"tool": tool})
+        assert run_verify(chain.link, carrying, gravity, record, poses=4, seed=2).passed
+    finally:
+        chain.simulated.detach_mass()

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calib.arm.urdf import xml_comment
 from sim_gap.better_model.export import module_text
 from sim_gap.better_model.training_files import write_entries
-from sim_gap.better_model.urdf import xml_comment
 
 HOSTILE = (
     '"]); import os; os.system("touch made") #',

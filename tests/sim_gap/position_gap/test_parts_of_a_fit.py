@@ -9,7 +9,7 @@ import pytest
 from servo_arm import at_both, model_text, record, search_on
 
 from armlink.recording.recording import Recording
-from sim_gap.better_model.corrected_model import body_parameters, set_body
+from gcomp.arm.inertials import body_parameters, set_body
 from sim_gap.position_gap import choice as edits
 from sim_gap.position_gap import fit as fitting
 from sim_gap.position_gap.choice import best_level, look_about, select

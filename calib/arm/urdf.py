@@ -9,10 +9,9 @@ import numpy as np
 
 from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
-from gcomp.arm.model_file import parse_xml
+from gcomp.arm.inertials import body_parameters, mass_centre_inertia
+from gcomp.arm.model_file import linear_part, parse_xml
 from gcomp.arrays import Array
-from sim_gap.better_model.corrected_model import body_parameters, mass_centre_inertia
-from sim_gap.model.load import linear_part
 
 
 def xml_comment(lines: list[str]) -> str:

@@ -1,0 +1,143 @@
+"""A model whose bodies have given mass moments and can exist: the closest such bodies to the model's own.
+
+Gravity tells 2n combinations of masses and first moments. Among all bodies that have them, those with the least
+entropic divergence from the model's are taken: tr(P₀⁻¹P) − log det(P₀⁻¹P), P the pseudo-inertia matrix, which is
+positive definite for every body that can exist (Lee, Wensing and Park, IEEE Transactions on Robotics 36, 2020).
+"""
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from gcomp.arm.arm import Arm
+from gcomp.arm.inertials import body_parameters, set_body
+from gcomp.arm.load import PlacedChain
+from gcomp.arm.mass_moments import base_parameters
+from gcomp.arrays import Array
+
+SMALLEST_SHARE = 1e-2
+"""Mass of a body that the model gives none, as a share of the mean link; it is spread over half of a link's length."""
+MOST_STAGES = 1000
+"""One is usual; some thirty where bodies are multiplied by a hundred."""
+MOST_STEPS = 50
+"""Newton steps of a stage; ten are usual."""
+RESOLUTION = float(np.finfo(float).eps)
+
+
+def with_moments(placed: PlacedChain, beta: Array) -> Any:
+    """A copy of the compiled model with mass moments β (2n,) [kg·m], of which each link's heaviest body changes.
+
+    It is for `write_bodies`: what MuJoCo sums up when it compiles is as before.
+    """
+    arm, model = placed.arm.arm, copy.copy(placed.model)
+    heaviest = [max(bodies, key=lambda body: float(model.body_mass[body])) for bodies in placed.bodies]
+    own = np.array([_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)])
+    rest = placed.arm.beta - base_parameters(arm, own[:, 0], own[:, 1:4])
+    found = closest_bodies(arm, np.array([_pseudo(each) for each in own]), beta - rest)
+    for link, body in enumerate(heaviest):
+        turn, origin = _body_in_bar_frame(placed, link, body)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn.T, -turn.T @ origin
+        set_body(model, body, np.zeros(3), _ten(matrix @ found[link] @ matrix.T))
+    return model
+
+
+def closest_bodies(arm: Arm, nominal: Array, beta: Array) -> Array:
+    """Pseudo-inertia matrices (n, 4, 4) in the bar frames with mass moments β (2n,) [kg·m], closest to `nominal`.
+
+    Moments that are far from the nominal bodies' are approached in stages, each with the closest bodies to those of the
+    stage before.
+    """
+    of = np.zeros((2 * arm.n, arm.n, 4, 4))
+    for link in range(arm.n):
+        mass, moments = np.zeros(arm.n), np.zeros((3, arm.n, 3))
+        mass[link], moments[range(3), link, range(3)] = 1.0, 1.0
+        of[:, link, 3, 3] = base_parameters(arm, mass, np.zeros((arm.n, 3)))
+        for axis, moment in enumerate(moments):
+            half = base_parameters(arm, np.zeros(arm.n), moment) / 2
+            of[:, link, axis, 3] = of[:, link, 3, axis] = half
+    bodies, reached = _spread(arm, nominal, beta), False
+    for _ in range(MOST_STAGES):
+        bodies, reached = _stage(of, bodies, beta)
+        if reached:
+            break
+    return bodies
+
+
+def _stage(of: Array, nominal: Array, beta: Array) -> tuple[Array, bool]:
+    """Bodies closest to the nominal ones with moments β_i = Σ tr(of_i P) on the way to β, and whether they have β.
+
+    The dual problem has no constraint: −log det(1 + Σ λ_i C_i) + λ·β, P = (1 + Σ λ_i C_i)⁻¹, in coordinates in which
+    the nominal bodies are 1. Newton steps go far enough for a few of them to do.
+    """
+    root = np.linalg.cholesky(nominal)
+    own = np.einsum("lji,cljk,lkm->clim", root, of, root)
+    size = np.sqrt((own**2).sum(axis=(1, 2, 3)))
+    acts = size > RESOLUTION * size.max()
+    own = own[acts] / size[acts, None, None, None]
+    now = np.einsum("clii->c", own)
+    gap = beta[acts] / size[acts] - now
+    curvature = np.einsum("clij,dlji->cd", own, own)
+    share = min(1.0, 1.0 / np.sqrt(max(float(gap @ np.linalg.solve(curvature, gap)), 1.0)))
+    target, price = now + share * gap, np.zeros(len(gap))
+
+    def cost(price: Array) -> tuple[float, Array]:
+        inverse = np.eye(4) + np.einsum("c,clij->lij", price, own)
+        if np.linalg.eigvalsh(inverse).min() <= 0:
+            return np.inf, inverse
+        return float(price @ target - np.linalg.slogdet(inverse)[1].sum()), np.linalg.inv(inverse)
+
+    least, bodies = cost(price)
+    for _ in range(MOST_STEPS):
+        turned = np.einsum("clij,ljk->clik", own, bodies)
+        gradient = target - np.einsum("clii->c", turned)
+        step = -np.linalg.solve(np.einsum("clij,dlji->cd", turned, turned), gradient)
+        length = 1.0
+        while (after := cost(price + length * step))[0] > least and length > RESOLUTION:
+            length /= 2
+        if length <= RESOLUTION:  # nothing is lower but for rounding
+            break
+        price, (least, bodies) = price + length * step, after
+    found: Array = root @ bodies @ np.swapaxes(root, 1, 2)
+    return found, share == 1.0
+
+
+def _spread(arm: Arm, nominal: Array, beta: Array) -> Array:
+    """Pseudo-inertias (n, 4, 4) that are positive definite: a body without mass or extent gets a little of both."""
+    length = float(np.linalg.norm(arm.span, axis=1).mean()) or 0.1
+    mean = max(float(nominal[:, 3, 3].mean()), float(np.abs(beta).max()) / length) or 1.0
+    least = SMALLEST_SHARE * mean * np.diag([(length / 2) ** 2] * 3 + [1.0])
+    root = np.sqrt(np.diag(least))
+    spread = nominal.copy()
+    for link, each in enumerate(nominal):
+        if np.linalg.eigvalsh(each / np.outer(root, root)).min() < SMALLEST_SHARE:
+            spread[link] += least
+    return spread
+
+
+def _body_in_bar_frame(placed: PlacedChain, link: int, body: int) -> tuple[Array, Array]:
+    """(Rotation, origin) of a body's frame in its link's bar frame."""
+    bar, data = placed.geometry.bar[link], placed.data
+    return bar.T @ data.xmat[body].reshape(3, 3), bar.T @ (data.xpos[body] - placed.geometry.origins[link])
+
+
+def _in_bar_frame(placed: PlacedChain, link: int, body: int) -> Array:
+    """Ten inertial parameters of a body in its link's bar frame."""
+    turn, origin = _body_in_bar_frame(placed, link, body)
+    return body_parameters(placed.model, body, -turn.T @ origin, turn)
+
+
+def _pseudo(ten: Array) -> Array:
+    """Pseudo-inertia matrix (4, 4) of ten parameters."""
+    inertia, out = ten[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = ten[1:4]
+    out[3, 3] = ten[0]
+    return out
+
+
+def _ten(pseudo: Array) -> Array:
+    """Ten parameters of a pseudo-inertia matrix (4, 4)."""
+    inertia = np.trace(pseudo[:3, :3]) * np.eye(3) - pseudo[:3, :3]
+    return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])

@@ -1,0 +1,75 @@
+"""Inertials of a model's bodies: ten parameters about a point, the bodies that can exist, and a model with others.
+
+The ten parameters are mass, first moment and inertia about the point: m, mx, my, mz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from gcomp.arrays import Array
+
+LEAST_SECOND_MOMENT = 1e-6
+"""Least second moment of mass along a principal axis [kg·m²]."""
+
+
+def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
+    """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
+    about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])
+
+
+def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
+    """Ten parameters of a body about a point of its frame, in a frame turned by `turn`."""
+    import mujoco
+
+    spin = np.zeros(9)
+    mujoco.mju_quat2Mat(spin, model.body_iquat[body])
+    axes = turn @ spin.reshape(3, 3)
+    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    return inertial_of(float(model.body_mass[body]), turn @ (model.body_ipos[body] - origin), inertia)
+
+
+def set_body(model: Any, body: int, anchor: Array, total: Array) -> bool:
+    """Give a body ten inertial parameters about a point of it, or the closest that can exist; whether it has them."""
+    mass, centre, about = mass_centre_inertia(total)
+    values, axes = np.linalg.eigh(about)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    possible = closest_possible(values)
+    model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass, anchor + centre, possible
+    mujoco_quaternion(model.body_iquat[body], axes)
+    model.body_sameframe[body] = 0  # else a body whose frames were one keeps its old centre of mass
+    return bool(np.allclose(possible, values, rtol=1e-3, atol=1e-9) and mass == total[0])
+
+
+def closest_possible(principal: Array) -> Array:
+    """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
+    spread = np.maximum(0.5 * principal.sum() - principal, LEAST_SECOND_MOMENT)
+    return np.asarray(spread.sum() - spread)
+
+
+def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
+    """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
+    mass = max(float(inertial[0]), 1e-6)
+    centre = inertial[1:4] / mass
+    about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+
+
+def mujoco_quaternion(out: Array, axes: Array) -> None:
+    import mujoco
+
+    mujoco.mju_mat2Quat(out, axes.ravel())
+
+
+def write_bodies(spec: Any, nominal: Any, model: Any) -> None:
+    """Write the bodies in which a compiled model differs from its nominal one into the specification of both."""
+    fields = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_gravcomp")
+    changed = {
+        i for field in fields for i in np.argwhere(getattr(model, field) != getattr(nominal, field))[:, 0].tolist()
+    }
+    for body in spec.bodies:
+        if (i := body.id) in changed:
+            body.explicitinertial, body.fullinertia = True, [np.nan] * 6
+            body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
+            body.inertia, body.gravcomp = model.body_inertia[i], float(model.body_gravcomp[i])
