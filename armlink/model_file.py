@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import MOST_TEXT
 from armlink.content.memory_budget import memory_budget
-from armlink.content.model_sizes import MOST_TEXT, model_budget
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 
 log = logging.getLogger(__name__)

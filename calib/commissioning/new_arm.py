@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
-from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.file_content import parse_yaml, read_whole
 from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
@@ -202,7 +202,7 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
 
     Of each joint it writes node, rated torque and identity, and the bus.
     """
-    edited = EditedYaml(read_whole(arm.path, MOST_YAML).decode())
+    edited = EditedYaml(read_whole(arm.path).decode())
     link: Any = edited.content["link"]
     for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
