@@ -27,8 +27,7 @@ from armlink.drives.findings import FoundDrive, SetupFinding
 from armlink.drives.searched_bus import SearchedBus
 from armlink.errors import BusFault
 
-_DEVICE_TYPE = b"\x00\x10\x00"
-_READ_DEVICE_TYPE = b"\x40" + _DEVICE_TYPE + bytes(4)
+_READ_DEVICE_TYPE = b"\x40" + objects.DEVICE_TYPE.address + bytes(4)
 
 
 def sdo_network(bus: SearchedBus) -> PumpedNetwork:
@@ -62,7 +61,8 @@ def scan_bus(bus: SearchedBus, joints: Mapping[int, str], stock: Collection[int]
 def _search(bus: SearchedBus) -> Counter[int]:
     """Node id → number of responses to one request."""
     heard = bus.gather([(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE) for node in range(1, 128)])
-    answers = [can_id - SDO_RESPONSE_ID for can_id, data in heard if len(data) == 8 and data[1:4] == _DEVICE_TYPE]
+    asked = objects.DEVICE_TYPE.address
+    answers = [can_id - SDO_RESPONSE_ID for can_id, data in heard if len(data) == 8 and data[1:4] == asked]
     return Counter(node for node in answers if 0 < node < 128)
 
 
