@@ -13,8 +13,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
-from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
-from armlink.content.model_sizes import MOST_TEXT
+from armlink.content.file_content import MOST_TEXT, parse_yaml, read_whole
 from armlink.contributed import contributed, named
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, meant
@@ -380,7 +379,7 @@ def load_arm(arm: str | Path) -> ArmFile:
 
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
-    return parse_yaml(read_whole(path, MOST_YAML), path)
+    return parse_yaml(read_whole(path), path)
 
 
 def _no_arm_file(path: Path) -> str:

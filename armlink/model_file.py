@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import MOST_TEXT
 from armlink.content.memory_budget import memory_budget
-from armlink.content.model_sizes import MOST_TEXT, model_budget
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 
 log = logging.getLogger(__name__)
@@ -115,7 +116,8 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
         if not mesh.file:
             continue
         file = _find(mesh.file, folder, folder / spec.compiler.meshdir)
-        weighed = [geom.parent.name for geom in spec.geoms if geom.meshname == mesh.name and not _has_inertial(geom)]
+        bodies = [geom.parent for geom in spec.geoms if geom.meshname == mesh.name]
+        weighed = [body.name for body in bodies if not body.explicitinertial and body.name != "world"]
         reason = NOT_FOUND if file is None else "" if mesh.content_type else _why_useless(file)
         if not reason:
             mesh.file = str(file)
@@ -200,9 +202,13 @@ def compile_model(path: Path, beside: Sequence[Beside] = (), locked: Mapping[str
 
     `locked` is as in `read_model`.
     """
-    found = read_model(path, locked)
+    import mujoco
+    import numpy as np
+
+    found, turned = read_model(path, locked), np.empty(4)
     for each in beside:
-        frame = found.spec.worldbody.add_frame(pos=each.at, quat=_quaternion(each.turned))
+        mujoco.mju_euler2Quat(turned, np.array(each.turned), "XYZ")
+        frame = found.spec.worldbody.add_frame(pos=each.at, quat=turned)
         found.spec.attach(read_model(each.path).spec, prefix=each.prefix, frame=frame)
     return compile_spec(found.spec, path, f" (without {found.left_out})" if found.left_out else "")
 
@@ -241,15 +247,6 @@ def _refuse_what_is_no_number(model: Any, path: Path) -> None:
             if not right.all():
                 what = f"{names[int(np.argmin(right))]}: {KEYS.get(key, key)}"
                 raise BadInput(f"{path}: {what}: NaN or infinity where a finite number is expected")
-
-
-def _quaternion(turned: tuple[float, float, float]) -> Any:
-    import mujoco
-    import numpy as np
-
-    found = np.empty(4)
-    mujoco.mju_euler2Quat(found, np.array(turned), "XYZ")
-    return found
 
 
 def one_line(error: Exception) -> str:
@@ -345,11 +342,6 @@ def _negative_inertias_removed(spec: Any) -> tuple[str, ...]:
             body.fullinertia = [*np.diag(kept), kept[0, 1], kept[0, 2], kept[1, 2]]
             changed.append(body.name)
     return tuple(changed)
-
-
-def _has_inertial(geom: Any) -> bool:
-    """Whether the body of a shape has its mass stated, or does not move."""
-    return bool(geom.parent.explicitinertial) or geom.parent.name == "world"
 
 
 def _drop(spec: Any, mesh: Any) -> None:

@@ -18,7 +18,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, V
 
 from armlink.arm_file import ArmFile, is_serial, load_arm
 from armlink.content.atomic_file import part_of, write_whole
-from armlink.content.file_content import MOST_JSON, read_whole
+from armlink.content.file_content import MOST_TEXT, read_whole
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
@@ -288,7 +288,7 @@ def _read_manifest(path: Path) -> Manifest:
     if not file.is_file():
         raise BadInput(f"{path}: there is no sweep data set, since {MANIFEST} is missing")
     try:
-        return Manifest.model_validate(json.loads(read_whole(file, MOST_JSON)))
+        return Manifest.model_validate(json.loads(read_whole(file, MOST_TEXT)))
     except ValidationError as error:
         raise BadInput(f"{file}: {describe(error)}") from None
     except (ValueError, RecursionError, OSError) as error:

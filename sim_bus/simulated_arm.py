@@ -87,7 +87,8 @@ class SimulatedArm:
             self._apply(node)
         self._compile()
         self.drives.set_devices([node.device for node in self.nodes], [node.place for node in self.nodes])
-        self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
+        self.drives.on_state = self._state_changed
+        self.drives.on_fault = lambda joint, code: self._node_at[joint].emergency(code, DRIVE_ERROR)
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
         self._readings = readings = Readings(self.plant, self.sensors)
@@ -357,9 +358,6 @@ class SimulatedArm:
         if node.errors and self.drives.state[joint] is DriveState.SWITCH_ON_DISABLED:
             node.emergency(0, 0)
         self._watching = self.drives.needs_watch
-
-    def _faulted(self, joint: int, code: int) -> None:
-        self._node_at[joint].emergency(code, DRIVE_ERROR)
 
     def _sample(self) -> None:
         self.drives.sample(self.time, self.time - self._sampled)

@@ -30,6 +30,7 @@ from can.io.blf import (
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import as_frame, is_data
 from armlink.bus.port import Frame
+from armlink.content.atomic_file import FLUSH_SECONDS
 from armlink.errors import BadInput, BusFault
 
 LOG_SUFFIXES = (".asc", ".blf", ".log")
@@ -45,8 +46,6 @@ PRINTED = re.compile(
 """A line as candump prints it, without the space about it: (time) channel id [length] bytes."""
 SPACING = 1e-4
 """Time from frame to frame where a log has none [s]: about that of full frames on a bus of 1 Mbit/s."""
-FLUSH_MICROSECONDS = 500_000
-"""Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 MOST_LINE = 1 << 16
 """Characters of a line; one of a CAN FD frame has some hundreds."""
 MOST_IDS = 2000
@@ -107,7 +106,7 @@ class FrameLog:
     def write(self, message: can.Message, stamp: int) -> None:
         message.timestamp = stamp / 1e6
         self._writer.on_message_received(message)
-        if stamp - self._flushed > FLUSH_MICROSECONDS:
+        if stamp - self._flushed > FLUSH_SECONDS * 1e6:
             self._writer.file.flush()
             self._flushed = stamp
 

@@ -48,7 +48,6 @@ class InProcessPort:
         self.send: Callable[[int, bytes], None] = bus.put
         self.receive: Callable[[float], Frame | None] = bus.take
         self.pass_time: Callable[[float], None] = bus.pass_time
-        """Advances the bus's time by a period [s], for a host whose cycle has no SYNC that does."""
 
     @property
     def errors(self) -> int:

@@ -13,6 +13,9 @@ from typing import IO
 
 from armlink.errors import BadInput
 
+FLUSH_SECONDS = 0.5
+"""Interval of flushes of what is recorded: a killed recorder loses at most this and what the operating system had not
+written."""
 NO_ROOM_BESIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
 """Why no file can be made in a folder in which one may be written: such a file is written in place."""
 

@@ -7,16 +7,18 @@ import yaml
 
 from armlink.errors import BadInput
 
-MOST_YAML = 4 << 20
-"""Size of an arm file, record or description of a bag [bytes]; the covariance of a record of 64 joints has
-192 by 192 numbers of some 22 characters, 0.8 MB."""
-MOST_JSON = 64 << 20
-"""Size of a JSON file, such as the description of a LeRobot data set with its statistics [bytes]; a choice."""
+MOST_SMALL = 4 << 20
+"""Size of an arm file, record, data sheet or description of a bag [bytes]; the covariance of a record of 64 joints has
+192 by 192 numbers of some 22 characters, 0.8 MB, and data sheets of drives with all their profiles some hundreds of
+kB."""
+MOST_TEXT = 64 << 20
+"""Size of a URDF, MJCF or JSON file, and of an OBJ or MSH mesh [bytes]: a hundred times that of published arms' files,
+and more than the statistics of a LeRobot data set."""
 MOST_NODES = 200_000
 """Values in a YAML file, each counted as often as aliases repeat it; the 4 MB above hold about as many."""
 
 
-def read_whole(path: Path, most: int) -> bytes:
+def read_whole(path: Path, most: int = MOST_SMALL) -> bytes:
     """The content of a file of at most `most` bytes; raises BadInput beyond that and for a device, OSError."""
     if path.exists() and not path.is_file():
         raise BadInput(f"{path}: is not a file: expected a file of at most {most / 1e6:.0f} MB")

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from armlink.content.file_content import MOST_TEXT
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 
-MOST_TEXT = 64 << 20
-"""Size of a URDF or MJCF file, and of an OBJ or MSH mesh [bytes]: a hundred times that of published arms' files."""
 MOST_FILES = 100
 """Files that a model may include."""
 MOST_ELEMENTS = 200_000

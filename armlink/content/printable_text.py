@@ -18,7 +18,8 @@ def printable_text(text: str, keep: str = "") -> str:
     """
     if text.isprintable():
         return text
-    return "".join(each if _is_harmless(each) or each in keep else _escape(each) for each in text)
+    escaped = (each if _is_harmless(each) or each in keep else each.encode("unicode_escape").decode() for each in text)
+    return "".join(escaped)
 
 
 def printable_json(value: Any, **options: Any) -> str:
@@ -39,7 +40,3 @@ class PrintableFormatter(logging.Formatter):
 
 def _is_harmless(character: str) -> bool:
     return character.isprintable() or unicodedata.category(character) == "Zs"
-
-
-def _escape(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")

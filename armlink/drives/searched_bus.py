@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame, Port
-from armlink.clock import Clock, MonotonicClock
+from armlink.clock import MonotonicClock
 from armlink.drives.base import ANSWER, TRIES
 
 T = TypeVar("T")
@@ -15,19 +15,16 @@ its heartbeat every 0.1 s unless it is set otherwise [s]."""
 
 
 class SearchedBus:
-    def __init__(self, bus: CanBus) -> None:
+    def __init__(self, bus: CanBus, port: Port | None = None) -> None:
+        """Listen to what is sent unasked; where the `port` to search is given, such as one bus of several, do not."""
         self.channel_info = bus.channel_info
         self.fd: bool = getattr(bus, "fd", True)
         """Whether it carries CAN FD; a bus inside this process does."""
-        self.clock: Clock = bus.clock or MonotonicClock()
-        self.now, self.port = self.clock.now, bus.open_port()
+        self.now, self.port = (bus.clock or MonotonicClock()).now, port or bus.open_port()
         self.send = self.port.send
         self.take: Callable[[int, bytes, float], object] = lambda can_id, data, now: None
-        self.heard = self.gather([])
+        self.heard = self.gather([]) if port is None else []
         """Frames that came before anything was asked."""
-
-    def open_port(self, as_node: bool = False) -> Port:
-        return self.port
 
     def gather(self, requests: Sequence[Frame]) -> list[Frame]:
         """All frames that come from the first request to SEARCH_SECONDS after the last; each is sent once."""

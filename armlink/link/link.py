@@ -90,7 +90,7 @@ class Link(Calibrations):
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
-        self._last: Command | None = None
+        self.last: Command | None = None
         self._hold: ArmHold | None = None
         self._overloaded = overloaded
         self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
@@ -144,10 +144,6 @@ class Link(Calibrations):
     def addresses(self) -> list[tuple[str, str]]:
         """Bus, by its name in the arm file, and id of each joint's drive."""
         return [(joint.bus, joint.settings.address) for joint in self.section.joints]
-
-    @property
-    def last(self) -> Command | None:
-        return self._last
 
     @property
     def latest_position(self) -> Array:
@@ -336,7 +332,7 @@ class Link(Calibrations):
             raise
         self._forget()
         self._enabled, self._held = True, False
-        self._last = Command.hold(np.array(self._loop.latest_position))
+        self.last = Command.hold(np.array(self._loop.latest_position))
         return sample
 
     def recover(self) -> Sample:
@@ -390,7 +386,7 @@ class Link(Calibrations):
         """
         if not self._enabled:
             raise BusFault("the joints are not enabled: call start() and enable() before cycle()")
-        self._last = command
+        self.last = command
         try:
             sample = self.commander.command(command)
         except BaseException as error:
@@ -425,7 +421,7 @@ class Link(Calibrations):
 
     def run(self, controller: Controller) -> Samples:
         """A controller in the loop, cycle by cycle, until the iterator is closed; raises as cycle."""
-        sample = self.cycle(self._last or Command.hold(self.position_sent))
+        sample = self.cycle(self.last or Command.hold(self.position_sent))
         while True:
             sample = self.cycle(controller.command(sample))
             yield sample
@@ -455,7 +451,7 @@ class Link(Calibrations):
         Raises BusFault where nothing can be sent, and nothing for the fault of a joint.
         """
         sample = self.commander.keep(goal)
-        self._last = Command.hold(np.array([order.position for order in self.commander.passed]))
+        self.last = Command.hold(np.array([order.position for order in self.commander.passed]))
         return sample
 
     def let_go(self) -> None:
@@ -481,8 +477,8 @@ class Link(Calibrations):
                 taken += 1
                 continue
             taken = 0  # a bus that never falls silent must not keep the joints waiting for their commands
-            if self._enabled and self._last is not None:
-                self.cycle(replace(self._last, t=None))
+            if self._enabled and self.last is not None:
+                self.cycle(replace(self.last, t=None))
             elif self._held:
                 self.keep()
             elif not self._loop.receive(remaining):

@@ -61,27 +61,24 @@ class CycleProcess:
         self._process.wait()
 
 
-class Remote:
-    """Whatever asks the process to call a method of its link."""
-
-    _ask: Callable[[Call], LoopAnswer]
-
-    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        return self._ask(Call(next(numbers), what, args, kwargs)).result()
-
-
-def remote(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Remote, P], R]:
+def remote(method: Callable[Concatenate[Any, P], R]) -> "Callable[Concatenate[RemoteControllers, P], R]":
     """A method of the link's protocol, as a request to the process."""
 
     @wraps(method)
-    def ask(self: Remote, /, *args: P.args, **kwargs: P.kwargs) -> R:
+    def ask(self: "RemoteControllers", /, *args: P.args, **kwargs: P.kwargs) -> R:
         return cast(R, self._call(method.__name__, *args, **kwargs))
 
     return ask
 
 
-class RemoteControllers(Remote):
+class RemoteControllers:
     """`Controllers` through the process; waits for the answers."""
+
+    def __init__(self, ask: Callable[[Call], LoopAnswer]) -> None:
+        self._ask = ask
+
+    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        return self._ask(Call(next(numbers), what, args, kwargs)).result()
 
     read_calibration = remote(Controllers.read_calibration)
     drive_serial = remote(Controllers.drive_serial)

@@ -11,7 +11,7 @@ from armlink.errors import BusFault
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller, Tell
 from armlink.loop.channel import Closed
-from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers
+from armlink.loop.cycle_process import CycleProcess, numbers
 from armlink.loop.ending import HANG_SECONDS
 from armlink.loop.messages import (
     Batch,
@@ -29,13 +29,6 @@ from armlink.loop.messages import (
 
 ENDED = "the bus loop's process has ended"
 KeptMessage = Told | Batch | Up | Down | LoopAnswer | Progress | Stopped
-
-
-class KeptControllers(RemoteControllers):
-    """Calibrations of every joint; waits for the answer."""
-
-    def __init__(self, ask: Callable[[Call], LoopAnswer]) -> None:
-        self._ask = ask
 
 
 class BatchMaker:

@@ -11,7 +11,6 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.arrays import Array
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause, cause_of
 from armlink.link.park import park
@@ -45,8 +44,9 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self._stopped: Stopped | None = None
         self._answers: dict[int, LoopAnswer] = {}
         self._in_force: Command | None = None
-        self._torque_sent = self._position_sent = np.full(self.n, np.nan)
-        self._step = np.full(self.n, np.inf)
+        self.torque_sent = self.position_sent = np.full(self.n, np.nan)
+        """As ArmDriver has them, but of the newest sample taken."""
+        self.position_step = np.full(self.n, np.inf)
         self._told = self._heard = time.monotonic()
         self._tell_on: Tell = lambda text: None
         super().__init__(Open(arm, bus))
@@ -65,20 +65,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self._end(cause_of(error if isinstance(error, BaseException) else None))
 
     @property
-    def position_step(self) -> Array:
-        return self._step
-
-    @property
-    def position_sent(self) -> Array:
-        """Target position of the newest sample taken (n,) [rad]."""
-        return self._position_sent
-
-    @property
-    def torque_sent(self) -> Array:
-        """Target torque of the newest sample taken (n,) [N·m]."""
-        return self._torque_sent
-
-    @property
     def stats(self) -> Stats:
         found: Stats = self._call("stats")
         return found
@@ -95,7 +81,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def start(self) -> None:
         self._call("start")
-        self._step = self._call("position_step")
+        self.position_step = self._call("position_step")
 
     def enable(self) -> Sample:
         return self._enabled("enable")
@@ -107,8 +93,8 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self._stopped = None
         sample: Sample = self._call(how)
         self._samples.clear()
-        self._position_sent, self._torque_sent = self._call("position_sent"), self._call("torque_sent")
-        self._in_force = Command.hold(self._position_sent)
+        self.position_sent, self.torque_sent = self._call("position_sent"), self._call("torque_sent")
+        self._in_force = Command.hold(self.position_sent)
         return sample
 
     def park(self) -> None:
@@ -182,7 +168,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
                 raise BusFault(f"no cycle was made for {SAMPLE:g} s: the process that drives the arm hangs")
         self._tell()
         id, row, content = self._samples.popleft()
-        sample, self._torque_sent, self._position_sent = unpack(content)
+        sample, self.torque_sent, self.position_sent = unpack(content)
         return id, row, sample
 
     def _raise_stopped(self) -> None:

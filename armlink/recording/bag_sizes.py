@@ -10,14 +10,13 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdDecompressor, ZstdError
 
-from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.file_content import parse_yaml, read_whole
 from armlink.errors import BadInput
 from armlink.recording.mcap import DAMAGED, most_record, require_chunk_size
-from armlink.recording.recording import require_size
+from armlink.recording.recording import PIECE, require_size
 
 MOST_WINDOW = 1 << 27
 """Window of zstd [bytes]: what its own command allows without `--long`."""
-PIECE = 1 << 20
 
 
 def require_bag_sizes(path: Path) -> None:
@@ -25,7 +24,7 @@ def require_bag_sizes(path: Path) -> None:
     if path.is_dir():
         description = path / "metadata.yaml"
         if description.is_file():
-            parse_yaml(read_whole(description, MOST_YAML), description)
+            parse_yaml(read_whole(description), description)
         files = [each for each in path.iterdir() if each.is_file()]
     else:
         files = [path]

@@ -68,7 +68,9 @@ def suggested_map(header: Sequence[str]) -> str:
     pairs, taken = [("t", time or "TIME")], {"t": [time]}
     for channel, columns in chosen.items():
         if len(columns) == joints:
-            taken[channel] = [column for _, column in sorted(columns, key=_by_number)]
+            taken[channel] = [
+                column for _, column in sorted(columns, key=lambda pair: pair[0] if isinstance(pair[0], int) else 0)
+            ]
             pairs += [(f"{channel}_{i}", column) for i, column in enumerate(taken[channel], start=1)]
     foreign = [f"{ours}={column}" for ours, column in pairs if ours != column]
     text = "--map " + ",".join(f"'{pair}'" if re.search(r"[ ();&]", pair) else pair for pair in foreign)
@@ -85,10 +87,6 @@ def joint_names(columns: Sequence[str]) -> tuple[str, ...]:
     keys = [_parts(column)[1] for column in columns]
     names = tuple(key for key in keys if isinstance(key, str) and re.search("[a-z]{2}", key))
     return names if names and len(set(names)) == len(columns) else ()
-
-
-def _by_number(pair: tuple[int | str, str]) -> int:
-    return pair[0] if isinstance(pair[0], int) else 0
 
 
 def _plain(column: str) -> str:

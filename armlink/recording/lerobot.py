@@ -15,7 +15,7 @@ import pyarrow.compute as pa_compute
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
-from armlink.content.file_content import MOST_JSON, read_whole
+from armlink.content.file_content import MOST_TEXT, read_whole
 from armlink.errors import BadInput
 from armlink.recording.parquet import THREADS, has_lists, numbers, require_numbers
 from armlink.recording.recording import MOST_JOINTS, Recording, default_names, require_size
@@ -64,7 +64,7 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
 
 def _features(path: Path) -> dict[str, Any]:
     try:
-        features = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))["features"]
+        features = json.loads(read_whole(path / "meta" / "info.json", MOST_TEXT))["features"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise BadInput(
             f"{path}/meta/info.json: cannot read the joint names of {STATES[0]} ({type(error).__name__} {error})"

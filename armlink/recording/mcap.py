@@ -23,7 +23,7 @@ from mcap.writer import Writer
 from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
-from armlink.content.atomic_file import open_whole
+from armlink.content.atomic_file import FLUSH_SECONDS, open_whole
 from armlink.errors import BadInput
 from armlink.recording.joint_messages import (
     STATES,
@@ -37,8 +37,6 @@ from armlink.recording.joint_messages import (
 from armlink.recording.recording import MOST_BYTES, Recording, require_size
 from armlink.recording.ros_joint_state import NANO, SCHEMA, SCHEMA_NAME, JointStateDecoder, joint_state_encoder
 
-FLUSH_SECONDS = 0.5
-"""Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 MOST_CHUNK = 1 << 28
 """A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 DAMAGED = (McapError, ValueError, OverflowError, OSError, struct.error, ZstdError)

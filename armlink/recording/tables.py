@@ -16,6 +16,7 @@ from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
 from armlink.recording.csv_text import CsvLayout, is_number, layout_of, read_numbers, write_numbers
 from armlink.recording.recording import (
+    PIECE,
     Recording,
     channel_column,
     channels_of,
@@ -28,7 +29,6 @@ from armlink.recording.recording import (
 )
 
 _LOOK_BACK = 20_000  # bytes at the end of a CSV file that show how long its numbers are
-_PIECE = 1 << 24  # bytes that are unpacked at a time
 _MOST_HEADER = 1 << 18
 _MOST_RATIO, _SURELY_MUCH = 200, 1 << 28
 """A file that unpacks to more than _SURELY_MUCH bytes must not be smaller than this share of them."""
@@ -143,7 +143,7 @@ def _unpacked(packed: bytes, source: str) -> tuple[bytearray, bool]:
     while packed:
         member = zlib.decompressobj(wbits=31)
         while packed and not member.eof:
-            content += member.decompress(packed, _PIECE)
+            content += member.decompress(packed, PIECE)
             packed = member.unconsumed_tail
             require_size(len(content), source)
             if len(content) > _SURELY_MUCH and len(content) > _MOST_RATIO * whole:

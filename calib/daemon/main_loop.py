@@ -20,7 +20,8 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller, Tell
-from armlink.loop.kept_arm import KeptArm, KeptControllers
+from armlink.loop.cycle_process import RemoteControllers
+from armlink.loop.kept_arm import KeptArm
 from armlink.loop.messages import BATCH_SECONDS, Down, LoopAnswer, Told
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
@@ -294,7 +295,7 @@ class _CurrentProcess:
     """The service's `Port`: whichever bus process is the present one."""
 
     def __init__(self, process: Callable[[], KeptArm]) -> None:
-        self.controllers = KeptControllers(lambda call: process().ask(call))
+        self.controllers = RemoteControllers(lambda call: process().ask(call))
         self._process = process
 
     def move(self, controller: Controller, /) -> None:

@@ -11,6 +11,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.bus.port import BUS_SHIFT, InterfaceDown
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
+from armlink.link.bus_watchdog import MOST_FRAMES
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import SensorDrift
 from sim_bus.bus.fault_injector import Injector
@@ -24,8 +25,6 @@ TICK = 0.01
 """Maximum lag of the physics between frames that need it, unless a timer is due earlier [s]."""
 LATE = 2 * TICK
 """A lag beyond this means that this process was late, not that the host was silent [s]."""
-MOST_FRAMES = 1000
-"""Limit of frames per turn, so that a flood cannot block physics and timers."""
 LOCKSTEP_PATIENCE = 1.0
 """In lock-step, time runs again this long after the last SYNC, so that nodes notice a dead host [s]."""
 INTERRUPTED, TERMINATED = 130, 0
@@ -89,7 +88,7 @@ class ArmServer:
         receive = self._leading.receive
         try:
             frame = receive(TICK if self._lockstep else max(self._until_tick(), 0.0))
-            for _ in range(MOST_FRAMES):
+            for _ in range(MOST_FRAMES):  # a flood must not block physics and timers
                 if frame is None:
                     break
                 self._take_from_others()

@@ -45,7 +45,11 @@ def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
     _set_options(spec, arm, section)
     joints = [spec.joint(name) for name in arm.joint_names]
     for joint in joints:
-        _set_joint(joint, section)
+        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # torque ends where the arm file's drives end
+        joint.solref_limit = [max(section.stops.time_constant, 2 * section.step), 1.0]
+        joint.solimp_limit = STOP_IMPEDANCE
+        _set_friction(joint, section)
     for place, joint in enumerate(joints):
         target, kind = _add_gear(spec, place, [each.name for each in joints], state, section)
         motor = spec.add_actuator(name=f"motor {joint.name}", target=target)
@@ -118,14 +122,6 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser tolerances make stiction chatter
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.compiler.fusestatic = True  # legs and a head that stand still cost as much as links that move
-
-
-def _set_joint(joint: Any, section: SimSection) -> None:
-    joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-    joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # torque ends where the arm file's drives end
-    joint.solref_limit = [max(section.stops.time_constant, 2 * section.step), 1.0]
-    joint.solimp_limit = STOP_IMPEDANCE
-    _set_friction(joint, section)
 
 
 def _set_friction(what: Any, section: SimSection) -> None:

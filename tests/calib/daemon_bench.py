@@ -16,7 +16,8 @@ from armlink.bus.can_bus import CanBus
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller
 from armlink.loop.channel import Channel
-from armlink.loop.kept_arm import BatchMaker, KeptControllers, KeptMessage
+from armlink.loop.cycle_process import RemoteControllers
+from armlink.loop.kept_arm import BatchMaker, KeptMessage
 from armlink.loop.messages import Open, RunController
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
@@ -77,7 +78,7 @@ class InlineLoop:
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
         self.channel, self.batches = Channel(ours), BatchMaker()
         self.loop = KeptLoop(Channel(theirs), Open(arm, None, True, listen_only), open_bus, pace)
-        self.controllers = KeptControllers(self.loop._answer)
+        self.controllers = RemoteControllers(self.loop._answer)
         self.cycles = 1 if listen_only else round(0.1 * arm.require_link().rate)
         if not pace:
             self.loop._talked, self.loop.talk_every = time.monotonic(), math.inf

@@ -19,8 +19,6 @@ from armlink.drives.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
 
 SUFFIXES = (".eds", ".dcf")
-MOST_SHEET = 4 << 20
-"""Size of a data sheet [bytes]; those of drives with all their profiles have some hundreds of kB."""
 MOST_ENTRIES = 254
 """Largest sub-index of an array (CiA 301: 255 has another use)."""
 OPTIONAL = {
@@ -76,7 +74,7 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(f"{where}: expected a file that ends in {' or '.join(SUFFIXES)}")
     try:
-        content = read_whole(path, MOST_SHEET)
+        content = read_whole(path)
         _require_few_entries(content, where)
         sheet = import_eds(StringIO(_text(content)), joint.settings.node)
     except OSError as error:

@@ -39,11 +39,21 @@ class JointStates:
 
 def alarm(known: JointStates) -> BusFault | None:
     """The first event: emergency, restart, NMT state; a Stall where a joint did not hear its host."""
-    told = node_fault(known)
-    if told is None:
-        return None
-    watchdog = bool(known.emergencies) and next(iter(known.emergencies))[1] in WATCHDOGS
-    return Stall(told) if watchdog else BusFault(told)
+    for joint, code, register in known.emergencies:
+        fault = Stall if code in WATCHDOGS else BusFault
+        return fault(
+            f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
+        )
+    for joint in sorted(known.restarted):
+        return BusFault(
+            f"{known.names[joint]}: its drive has restarted (boot-up message): calibration and mode are lost; "
+            "find out why, then start again"
+        )
+    for joint, state in known.node_states.items():
+        if state != objects.OPERATIONAL:
+            found = objects.NMT_STATES.get(state, str(state))
+            return BusFault(f"{known.names[joint]}: its NMT state is {found}, expected operational")
+    return None
 
 
 def state_fault(known: JointStates, now: float, modes: Sequence[int], patience: float) -> BusFault | None:
@@ -71,22 +81,6 @@ def stopped_itself(known: JointStates, joint: int) -> str:
         return ""
     why = f" (emergency {watched[0]:04X}h, {emcy.name_of(watched[0])})" if watched else ""
     return f"{known.names[joint]} stopped itself{why}"
-
-
-def node_fault(known: JointStates) -> str | None:
-    """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
-    for joint, code, register in known.emergencies:
-        return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
-    for joint in sorted(known.restarted):
-        return (
-            f"{known.names[joint]}: its drive has restarted (boot-up message): calibration and mode are lost; "
-            "find out why, then start again"
-        )
-    for joint, state in known.node_states.items():
-        if state != objects.OPERATIONAL:
-            found = objects.NMT_STATES.get(state, str(state))
-            return f"{known.names[joint]}: its NMT state is {found}, expected operational"
-    return None
 
 
 def refused_mode(mode: int, display: int) -> str:

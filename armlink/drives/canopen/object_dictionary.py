@@ -23,6 +23,11 @@ class Entry:
         """PDO mapping entry: index << 16 | sub-index << 8 | bits (CiA 301, 1600h and 1A00h)."""
         return self.index << 16 | self.sub << 8 | self.bits
 
+    @property
+    def address(self) -> bytes:
+        """Index and sub-index as SDO frames carry them (CiA 301, 7.2.4.3)."""
+        return struct.pack("<HB", self.index, self.sub)
+
     def __str__(self) -> str:
         """For example `607Dh:01 lower position limit`."""
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"

@@ -114,7 +114,7 @@ class NodeServices:
     def has(self, entry: Entry) -> bool:
         """Whether the device has an object; raises BusFault if it does not answer."""
         try:
-            self._upload(entry)
+            self._transfer(entry, self.remote.sdo.upload)
         except SdoAbortedError as error:
             if error.code in ABSENT:
                 return False
@@ -123,33 +123,30 @@ class NodeServices:
 
     def read(self, entry: Entry) -> Any:
         try:
-            data = self._upload(entry)
+            data = bytes(self._transfer(entry, self.remote.sdo.upload))
         except SdoAbortedError as error:
             raise self.fault(entry, f"read refused: {error}") from None
         if len(data) != entry.bits // 8:
             raise self.fault(entry, f"{len(data)} bytes, expected {entry.bits // 8}")
         return struct.unpack("<" + entry.code, data)[0]
 
-    def _upload(self, entry: Entry) -> bytes:
-        """An object's bytes; raises BusFault, or SdoAbortedError if the device refuses."""
+    def _transfer(self, entry: Entry, transfer: Callable[[int, int], Any]) -> Any:
+        """What an upload or download returns; raises BusFault, or SdoAbortedError if the device refuses."""
         try:
-            return bytes(self.remote.sdo.upload(entry.index, entry.sub))
+            return transfer(entry.index, entry.sub)
         except SdoAbortedError:
             raise
         except SdoError as error:
-            raise self.fault(entry, no_answer(error)) from None
+            raise self.fault(entry, f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s ({error})") from None
         except MALFORMED as error:
             raise self.fault(entry, f"malformed SDO response: {error}") from None
 
     def write(self, entry: Entry, value: float) -> None:
+        client = self.remote.sdo
         try:
-            self.remote.sdo.download(entry.index, entry.sub, struct.pack("<" + entry.code, value))
+            self._transfer(entry, lambda *at: client.download(*at, struct.pack("<" + entry.code, value)))
         except SdoAbortedError as error:
             raise self.fault(entry, f"write of {value} refused: {error}") from None
-        except SdoError as error:
-            raise self.fault(entry, no_answer(error)) from None
-        except MALFORMED as error:
-            raise self.fault(entry, f"malformed SDO response: {error}") from None
 
     def write_checked(self, entry: Entry, value: float) -> None:
         """Set an object and read it back, bit for bit; raises BusFault."""
@@ -172,8 +169,3 @@ class NodeServices:
     def fault(self, entry: Entry, what: str) -> BusFault:
         """A fault of this node that names joint, node and object."""
         return BusFault(f"{self.joint} (node {self.node}): {entry}: {what}")
-
-
-def no_answer(error: SdoError) -> str:
-    """Message for an SDO transfer that failed without an abort code."""
-    return f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s ({error})"

@@ -19,9 +19,7 @@ OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 class DamiaoRegister(IntEnum):
     """Registers that armlink uses; all can be read."""
 
-    UNDER_VOLTAGE = 0
     TORQUE_CONSTANT = 1
-    OVER_TEMPERATURE = 2
     OVER_CURRENT = 3
     REPLY_ID = 7
     COMMAND_ID = 8
@@ -34,7 +32,6 @@ class DamiaoRegister(IntEnum):
     POSITION_RANGE = 21
     VELOCITY_RANGE = 22
     TORQUE_RANGE = 23
-    BIT_RATE = 35
     LARGEST_CURRENT = 59
 
 

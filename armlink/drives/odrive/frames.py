@@ -16,9 +16,6 @@ class Message(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERROR = 0x03
-    RX_SDO = 0x04
-    TX_SDO = 0x05
-    ADDRESS = 0x06
     AXIS_STATE = 0x07
     ESTIMATES = 0x09
     CONTROLLER_MODE = 0x0B

@@ -41,7 +41,6 @@ class Type(IntEnum):
     SET_ID = 7
     READ = 17
     WRITE = 18
-    FAULT_DETAIL = 21
     SAVE = 22
     REPORT = 24
 

@@ -15,6 +15,7 @@ import yaml
 from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.drives.canopen.check.scan import FoundNodes
+from armlink.drives.searched_bus import SearchedBus
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.drive_match import arm_of_bus
@@ -229,7 +230,7 @@ def comments(path: str) -> list[str]:
 
 def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0, -1.0, 2.0, 1.01])
-    drives = FoundNodes(LockStepBus(arm=arm))
+    drives = FoundNodes(SearchedBus(LockStepBus(arm=arm)))
     made.wire(drives, "the bus", hands(arm, made))
     assert [(each.level, each.where) for each in made.findings] == [
         ("error", "j2 (node 10)"),
@@ -332,7 +333,9 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
         joint = int(text[len("joint_")]) - 1
         arm.turn_by_hand(names[joint], (known.upper if "other" in text else known.lower)[joint])
 
-    found = arm_of_bus(FoundNodes(LockStepBus(arm=arm)), "the bus", {"interface": "x", "channel": "y"}, "mine", ask)
+    found = arm_of_bus(
+        FoundNodes(SearchedBus(LockStepBus(arm=arm))), "the bus", {"interface": "x", "channel": "y"}, "mine", ask
+    )
     rows = yaml.safe_load(found.text)["kinematics"]["joints"]
     assert [match.drive.node for match in found.matches] == [12, 10, 11, 13]
     lower = [row["lower"] for row in rows]
@@ -348,14 +351,14 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
 
 def test_in_order_of_ids_a_doubtful_rating_is_named(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[4, 3, 2, 1], position_gain=[1.0] * 4)
-    made.wire(FoundNodes(LockStepBus(arm=arm)), "the bus", None)
+    made.wire(FoundNodes(SearchedBus(LockStepBus(arm=arm))), "the bus", None)
     assert [each.where for each in made.findings] == ["j1 (node 1)", "j4 (node 4)"]
     assert "--by-hand" in made.findings[0].remedy
 
 
 def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[1, 2, 3, 4], position_gain=[1.0] * 4)
-    drives = FoundNodes(LockStepBus(arm=arm))
+    drives = FoundNodes(SearchedBus(LockStepBus(arm=arm)))
     with pytest.raises(BusFault, match="no drive read the motion of j1"):
         made.wire(drives, "the bus", lambda text: None)
     drives.found.pop()

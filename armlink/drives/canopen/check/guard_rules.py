@@ -96,9 +96,8 @@ class NodeRules:
     @property
     def stop(self) -> tuple[int, str]:
         """The SDO write that quick-stops it, at once and without SYNC."""
-        word = objects.CONTROL_WORD
-        head = bytes([_WRITE_2_BYTES]) + word.index.to_bytes(2, "little") + bytes([word.sub])
-        return objects.SDO_REQUEST_ID + self.node, (head + bytes([QUICK_STOP, 0, 0, 0])).hex()
+        request = bytes([_WRITE_2_BYTES]) + objects.CONTROL_WORD.address + bytes([QUICK_STOP, 0, 0, 0])
+        return objects.SDO_REQUEST_ID + self.node, request.hex()
 
     @property
     def restart(self) -> tuple[int, int]:
@@ -112,7 +111,8 @@ class NodeRules:
     def frames(self) -> dict[str, Any]:
         """RPDO1, RPDO2 and SDO requests."""
         rules: dict[str, Any] = {f"{objects.SDO_REQUEST_ID + self.node}": {"sdo": self._writes()}}
-        after = [[self._answers, self._written(entry)] for each in self.profile.pdos for entry in _mapping(each)]
+        written = [bytes([_ACKNOWLEDGED]) + entry.address for each in self.profile.pdos for entry in _mapping(each)]
+        after = [[self._answers, answer.hex()] for answer in written]
         for each in self.profile.pdos:
             if each.name not in (pdo.RPDO1.name, pdo.RPDO2.name):
                 continue
@@ -160,8 +160,7 @@ class NodeRules:
 
     def _readings(self, entry: Entry) -> list[dict[str, Any]]:
         """Where an object is read: in TPDOs, and in answers to SDO reads."""
-        size = entry.bits // 8
-        answer = bytes([_UPLOADED[size]]) + entry.index.to_bytes(2, "little") + bytes([entry.sub])
+        answer = bytes([_UPLOADED[entry.bits // 8]]) + entry.address
         found = [{"frame": self._answers, "prefix": answer.hex(), "at": 4, "code": entry.code}]
         for each in self.profile.pdos:
             if each.communication >= 0x1800:
@@ -193,9 +192,6 @@ class NodeRules:
             f"{entry.index:X}:{entry.sub:X}": {"name": f"{entry} of {self.name}", "code": entry.code, **bounds}
             for entry, bounds in allowed.items()
         }
-
-    def _written(self, entry: Entry) -> str:
-        return (bytes([_ACKNOWLEDGED]) + entry.index.to_bytes(2, "little") + bytes([entry.sub])).hex()
 
 
 def _record_writes() -> dict[Entry, dict[str, Any]]:

@@ -15,54 +15,42 @@ from armlink.arm_file import ArmFile
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus
-from armlink.bus.port import BUS_SHIFT, Port
-from armlink.clock import Clock, MonotonicClock
+from armlink.bus.port import BUS_SHIFT
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.controller_setup import Identity, identify, identity_mismatches, refused_identity
 from armlink.drives.canopen.eds_file import bundled, expected_identity, of_joints
 from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONSE_ID
 from armlink.drives.canopen.profile import Profile, lacking
-from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
 from armlink.drives.findings import FoundDrive, SetupFinding
-from armlink.drives.searched_bus import SEARCH_SECONDS
+from armlink.drives.searched_bus import SearchedBus
 from armlink.errors import BusFault
 
-_READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
+_READ_DEVICE_TYPE = b"\x40" + objects.DEVICE_TYPE.address + bytes(4)
 
 
-def reading_network(port: Port, clock: Clock) -> tuple[PumpedNetwork, Pump]:
-    """A network for SDO reads over a port, and the function that waits for their answers."""
-    network = PumpedNetwork(port.send)
-
-    def pump(done: Callable[[], bool], timeout: float) -> bool:
-        end = clock.now() + timeout
-        while not done():
-            frame = port.receive(max(0.0, end - clock.now()))
-            if frame is None or clock.now() > end + SEARCH_SECONDS:  # a babbling node must not block the search
-                return False
-            network.notify(frame[0], bytearray(frame[1]), 0.0)
-        return True
-
-    return network, pump
+def sdo_network(bus: SearchedBus) -> PumpedNetwork:
+    """A network for SDO reads, whose answers `bus.wait` waits for."""
+    network = PumpedNetwork(bus.send)
+    bus.take = lambda can_id, data, now: network.notify(can_id, bytearray(data), now)
+    return network
 
 
-def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str], stock: Collection[int] = ()) -> list[Identity]:
+def scan_bus(bus: SearchedBus, joints: Mapping[int, str], stock: Collection[int] = ()) -> list[Identity]:
     """Every node that answers a read of its device type, and the nodes of `joints` (node id → joint name) that do not.
 
     Nodes of `stock` are asked for the optional objects of the profile, too. Sorted by node id. Raises BusFault if one
     that answered stops answering.
     """
-    network, pump = reading_network(port, clock)
-    found = _search(port, pump, network)
-    dictionary = bundled()
+    found, network, dictionary = _search(bus), sdo_network(bus), bundled()
     identities = []
     for node in sorted({*+found, *joints}):
         name = joints.get(node, "")
         if found[node] > 1:  # both nodes would answer every request
             identities.append(Identity(name, node, present=True, answers=found[node]))
         elif found[node]:
-            services = NodeServices(network, name, node, dictionary, pump)
+            services = NodeServices(network, name, node, dictionary, bus.wait)
             lost = Profile(absent=lacking(services)).lost if node in stock else ()
             identities.append(replace(identify(services), lost=lost))
         else:
@@ -70,21 +58,12 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str], stock: Collect
     return identities
 
 
-def _search(port: Port, pump: Pump, network: PumpedNetwork) -> Counter[int]:
+def _search(bus: SearchedBus) -> Counter[int]:
     """Node id → number of responses to one request."""
-    found: Counter[int] = Counter()
-
-    def answered(can_id: int, data: bytearray, timestamp: float) -> None:
-        found[can_id - SDO_RESPONSE_ID] += bytes(data[1:4]) == _READ_DEVICE_TYPE[1:4]
-
-    for node in range(1, 128):
-        network.subscribe(SDO_RESPONSE_ID + node, answered)
-        port.send(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE)
-        pump(lambda: False, 0.0)
-    pump(lambda: False, SEARCH_SECONDS)
-    for node in range(1, 128):
-        network.unsubscribe(SDO_RESPONSE_ID + node, answered)
-    return found
+    heard = bus.gather([(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE) for node in range(1, 128)])
+    asked = objects.DEVICE_TYPE.address
+    answers = [can_id - SDO_RESPONSE_ID for can_id, data in heard if len(data) == 8 and data[1:4] == asked]
+    return Counter(node for node in answers if 0 < node < 128)
 
 
 def describe_type(device_type: int) -> str:
@@ -101,17 +80,17 @@ def _require_own_ids(found: Collection[Identity], channel: str) -> None:
 
 
 class FoundNodes:
-    """The drives of an open bus, by node id."""
+    """The drives of a bus, by node id."""
 
-    def __init__(self, bus: CanBus) -> None:
+    def __init__(self, bus: SearchedBus) -> None:
         """Search the bus; raises BusFault naming the node."""
-        port, clock = bus.open_port(), bus.clock or MonotonicClock()
-        self._channel = bus.channel_info
-        self.identities = {each.node: each for each in scan_bus(port, clock, {})}
-        network, pump = reading_network(port, clock)
+        self._bus = bus
+        self.identities = {each.node: each for each in scan_bus(bus, {})}
+        network, sheet = sdo_network(bus), bundled()
         self._services = {
-            node: NodeServices(network, f"node {node}", node, bundled(), pump) for node in self.identities
+            node: NodeServices(network, f"node {node}", node, sheet, bus.wait) for node in self.identities
         }
+        self._take = bus.take
 
     @property
     def nodes(self) -> list[dict[str, Any]]:
@@ -124,12 +103,14 @@ class FoundNodes:
     @cached_property
     def found(self) -> list[FoundDrive]:
         """As every drive describes itself; raises BusFault naming the node."""
-        _require_own_ids(self.identities.values(), self._channel)
+        _require_own_ids(self.identities.values(), self._bus.channel_info)
+        self._bus.take = self._take
         return [self._read(each) for each in self.identities.values()]
 
     def positions(self) -> dict[str, float]:
-        services = self._services
-        return {each.address: int(services[each.node].read(objects.POSITION)) * each.unit for each in self.found}
+        services, found = self._services, self.found
+        self._bus.take = self._take
+        return {each.address: int(services[each.node].read(objects.POSITION)) * each.unit for each in found}
 
     def _read(self, identity: Identity) -> FoundDrive:
         services = self._services[identity.node]
@@ -149,7 +130,7 @@ class FoundNodes:
 
 def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
     """Findings about the drives of an arm on an open bus of this name; raises BusFault."""
-    link, drives = arm_file.require_link(), FoundNodes(opened)
+    link, drives = arm_file.require_link(), FoundNodes(SearchedBus(opened, opened.open_port()))
     by_node, ours = {each.node: each for each in drives.found}, {joint.settings.node for joint in link.joints}
     spare = [each.node for each in drives.found if each.node not in ours]
     unknown = f"; nodes {', '.join(map(str, spare))} answer but belong to no joint" if spare else ""
@@ -202,7 +183,6 @@ def scan_report(
     }
     opened = open_link_bus(bus, link)
     try:
-        clock = opened.clock or MonotonicClock()
         port = opened.open_port()
         found = []
         for place, member in enumerate(port.members if isinstance(port, GroupPort) else (port,)):
@@ -210,7 +190,7 @@ def scan_report(
             if isinstance(opened, BusGroup):
                 named = [joint for joint in named if opened.tags[joint.bus] >> BUS_SHIFT == place]
             stock = {joint.settings.node for joint in named if joint.settings.torque != "record"}
-            found += scan_bus(member, clock, {joint.settings.node: joint.name for joint in named}, stock)
+            found += scan_bus(SearchedBus(opened, member), {joint.settings.node: joint.name for joint in named}, stock)
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
