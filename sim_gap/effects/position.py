@@ -107,8 +107,7 @@ EFFECTS = (
         "position.eccentricity",
         position_effect(reading_moves(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
         Plausibility(
-            prior_std=lambda _signals, _place: np.full(2, 0.1),
-            bounds=between(-WORST_ECCENTRICITY, WORST_ECCENTRICITY),
+            prior_std=lambda _signals, _place: np.full(2, 0.1), bounds=between(-WORST_ECCENTRICITY, WORST_ECCENTRICITY)
         ),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,
