@@ -102,10 +102,11 @@ def wired_text(
     if bus is not None:
         link["bus"] = edited.in_line(bus)
     if serial:
-        edited.content["serial"] = serial
+        edited.content["serial"] = edited.scalar(serial)
         edited.content.yaml_add_eol_comment("assumed: the serial of the first drive", "serial")
     if arm.model_path is not None:
-        edited.content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+        model = os.path.relpath(arm.model_path, out.resolve().parent)
+        edited.content["kinematics"]["model"] = edited.scalar(model)
     return _annotated(edited.text, notes, "" if bus is None else NO_BUS), findings
 
 
@@ -166,10 +167,9 @@ def _row_comments(text: str) -> list[list[str]]:
 def _annotated(text: str, notes: Sequence[Sequence[str]], outdated: str) -> str:
     """The text with these comments below the joints' rows, in place of those there, and without a comment that is
     `outdated`."""
-    lines = text.splitlines()
+    lines = text.splitlines(keepends=True)
     rows = EditedYaml(text).content["link"]["joints"]
     for row, known, new in reversed(list(zip(rows, _row_comments(text), notes, strict=True))):
         start = row.lc.line + 1
-        lines[start : start + len(known)] = [yaml_comment(note, row.lc.col + 2) for note in new]
-    kept = [line for line in lines if not (outdated and line.lstrip().startswith(f"# {outdated}"))]
-    return "\n".join(kept) + "\n"
+        lines[start : start + len(known)] = [f"{yaml_comment(note, row.lc.col + 2)}\n" for note in new]
+    return "".join(line for line in lines if not (outdated and line.lstrip().startswith(f"# {outdated}")))

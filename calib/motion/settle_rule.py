@@ -34,12 +34,7 @@ class SettleRule:
 
     @classmethod
     def of(
-        cls,
-        section: SweepSection,
-        standard_error: Array,
-        period: float,
-        slowest: float = 0.0,
-        torque_cycles: int = 1,
+        cls, section: SweepSection, standard_error: Array, period: float, slowest: float = 0.0, torque_cycles: int = 1
     ) -> "SettleRule":
         """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s].
 
