@@ -294,9 +294,8 @@ class ArmFile(Section):
 
     @property
     def has_geometry(self) -> bool:
-        """Whether it is known where the joints are: of drives alone, Denavit-Hartenberg rows are all zero."""
-        rows = self.kinematics.joints
-        return self.kinematics.model is not None or any(row.a or row.alpha or row.d for row in rows)
+        """Whether it is known where the joints are: of drives alone, all Denavit-Hartenberg rows are zero."""
+        return not self.kinematics.joints or any(row.a or row.alpha or row.d for row in self.kinematics.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

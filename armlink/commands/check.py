@@ -107,13 +107,8 @@ def check(
         )
     passed = sum(each.outcome == "passed" for each in found)
     out.print(f"all {passed} checks passed; {'the joints were not enabled' if passive else joints_left(described)}")
-    if passive:
-        step = command_line("check", arm, bus=bus)
-    elif described.has_geometry:
-        step = command_line("sweep", arm, "--plan", bus=bus)
-    else:
-        step = command_line("doctor", arm, bus=bus)
-    suggest(step)
+    step = ["check", arm] if passive else ["sweep", arm, "--plan"] if described.has_geometry else ["doctor", arm]
+    suggest(command_line(*step, bus=bus))
     return 0
 
 

@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import typer
 from rich.console import Console, RenderableType
@@ -24,9 +24,6 @@ from rich.text import Text
 from armlink.commands.fitted_table import fitted
 from armlink.content.printable_text import printable_text
 from armlink.errors import Declined
-
-if TYPE_CHECKING:
-    from armlink.arm_file import ArmFile
 
 PIPE_WIDTH = 10_000
 """Columns of a pipe or file: no line is broken there, unless the environment says COLUMNS."""
@@ -111,13 +108,6 @@ def command_line(*words: str, **options: object) -> str:
     """A command ready to be pasted; an option is left out where its value is None."""
     given = [(f"--{name.replace('_', '-')}", str(value)) for name, value in options.items() if value is not None]
     return shlex.join(["armlink", *words, *(word for pair in given for word in pair)])
-
-
-def first_check(arm: "ArmFile", word: str, bus: str | None = None) -> str:
-    """The check that an arm begins with: without power, unless it is simulated in this process."""
-    from armlink.loop.open import is_in_process
-
-    return command_line("check", word, *(() if is_in_process(arm, bus) else ("--passive",)), bus=bus)
 
 
 def suggest(command: str) -> None:

@@ -26,9 +26,10 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import first_check, results, suggest
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.drives.family import family
     from armlink.errors import BadInput
+    from armlink.loop.open import first_check
 
     if arm is None:
         if bus is None:
@@ -42,7 +43,7 @@ def scan(
     else:
         status = _ask_all(described, bus, json)
     if status == 0:
-        suggest(first_check(described, arm, bus))
+        suggest(command_line(*first_check(described, arm, bus), bus=bus))
     return status
 
 
@@ -104,14 +105,20 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
 
 def _table(channel: str, nodes: list[dict[str, Any]], more: tuple[str, ...] = ()) -> "Table":
     from rich.box import SIMPLE
-    from rich.table import Column, Table
+    from rich.table import Table
     from rich.text import Text
 
-    table = Table(Column("joint", overflow="fold"), "family", "id", "state", "device", "serial", "firmware", *more)
-    table.box, table.title = SIMPLE, channel
+    heads = ("joint", "family", "id", "state", "device", "serial", "firmware", *more)
+    rows = []
     for node in nodes:
         state = node["power"] if node["present"] else Text("no answer", style="red")
         told = [f"{node[key]:02X}h" if isinstance(node[key], int) else node[key] for key in more]
         cells = (node["joint"], node["family"], node["address"], state, node["name"], str(node["serial"]))
-        table.add_row(*cells, node["firmware"], *told)
+        rows.append((*cells, node["firmware"], *told))
+    table = Table(box=SIMPLE, title=channel)
+    told_of = [place for place, column in enumerate(zip(*rows, strict=True)) if any(column)]
+    for place in told_of:
+        table.add_column(heads[place], overflow="fold" if heads[place] == "joint" else "ellipsis")
+    for row in rows:
+        table.add_row(*(row[place] for place in told_of))
     return table

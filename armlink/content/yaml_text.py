@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
 from armlink.content.printable_text import printable_text
 
@@ -71,8 +72,14 @@ class EditedYaml:
         self.content: Any = self._yaml.load(text)
         """Mappings and lists of the text, to be changed in place."""
 
+    @staticmethod
+    def scalar(value: Any) -> Any:
+        """A value to be set: text in quotes where the dumper of this module would quote it."""
+        return DoubleQuotedScalarString(value) if isinstance(value, str) and yaml_value(value) != value else value
+
     def in_line(self, values: Mapping[str, Any]) -> Any:
-        made = CommentedMap(values)
+        """A mapping that is written on one line."""
+        made = CommentedMap({key: self.scalar(value) for key, value in values.items()})
         made.fa.set_flow_style()
         return made
 

@@ -18,6 +18,11 @@ def is_in_process(arm: ArmFile, bus: str | None = None) -> bool:
     return resolve_bus(bus, section.bus).interface in IN_PROCESS
 
 
+def first_check(arm: ArmFile, word: str, bus: str | None = None) -> list[str]:
+    """Words of the check that an arm begins with: without power, unless it is simulated in this process."""
+    return ["check", word] if is_in_process(arm, bus) else ["check", word, "--passive"]
+
+
 def open_arm(arm: ArmFile, bus: str | None = None) -> ArmDriver:
     """The arm on bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput, BusFault."""
     return Link.open(arm, bus) if is_in_process(arm, bus) else RemoteLink(arm, bus)

@@ -17,12 +17,7 @@ from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.csv_text import no_time
 from armlink.recording.recording import Recording, columns_of, is_channel, require_size, require_width
-from armlink.recording.tables import (
-    names_of_columns,
-    recording_of_columns,
-    renamed_header,
-    require_each_once,
-)
+from armlink.recording.tables import names_of_columns, recording_of_columns, renamed_header, require_each_once
 
 NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""

@@ -30,42 +30,27 @@ ASKED_CYCLES = 5
 """Cycles that a drive has to tell its state when it is asked."""
 
 
-REACTIONS: dict[Silence, str] = {
-    "holds": "holds",
-    "damps": "sinks, damped",
-    "falls": "falls free",
-    "keeps on": "keeps on, so no joint is driven",
-}
-
-
 def announcement(arm: ArmFile) -> str:
     """The test with power in sentences, for a person who is asked before it begins."""
     groups, deadline = make_groups(arm), arm.require_link().deadline * 1e3
-    joints = zip(arm.joint_names, by_joint(groups), traits_of(groups), strict=True)
-    reactions: dict[str, list[str]] = {}
-    for name, (group, _), traits in joints:
-        reactions.setdefault(f"{REACTIONS[traits.silence]} ({group.family.name})", []).append(name)
+    drives: dict[str, list[str]] = {}
+    for name, (group, place) in zip(arm.joint_names, by_joint(groups), strict=True):
+        drives.setdefault(f"{group.drives.traits(place).silence} ({group.family.name})", []).append(name)
     steps = groups[0].family.self_test_steps.format(deadline=deadline) if len(groups) == 1 else ""
     if not steps:
-        who = {
-            does: f"{', '.join(names)}:" if len(reactions) > 1 else "every joint" for does, names in reactions.items()
-        }
-        told = "; ".join(f"{names} {does}" for does, names in who.items())
+        told = "; ".join(f"{', '.join(names)}: {drive}" for drive, names in drives.items())
         steps = (
             f"One joint after the other then gets no commands for up to {PATIENCE * deadline:.0f} ms, until its drive "
-            f"reacts. By the traits of the drives, {told}. A joint whose drive does not report its state is turned by "
-            f"{LEAN} rad before that."
+            f"reacts. By the traits of the drives, {told}. A joint whose drive does not report its state is "
+            f"turned by {LEAN} rad before that."
         )
-    if all(traits.silence == "holds" for traits in traits_of(groups)):
-        end = "At the end the joints hold, in quick stop."
-    elif arm.require_link().park is None:
-        end = "At the end the arm is slowly lowered, and its power is switched off."
-    else:
-        end = "At the end the arm moves to link.park, and its power is switched off."
+    end = "the joints hold, in quick stop"
+    if not all(drive.startswith("holds") for drive in drives):
+        end = "the arm is parked or slowly lowered, and its power switched off"
     return (
         f"This test enables every joint of {arm.name} and lets it hold where it stands (with at most its max_torque). "
-        f"{steps} {end} A drive that reacts in another way may let its joint fall: put the arm where no joint can "
-        "fall, keep clear, and keep a hand on the emergency stop."
+        f"{steps} At the end {end}. A drive that reacts in another way may let its joint fall: put the arm where no "
+        "joint can fall, keep clear, and keep a hand on the emergency stop."
     )
 
 

@@ -116,13 +116,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
     title, short = f"{arm.name}: {len(plan.sweeps)} sweeps", _short(arm.joint_names)
     table = Table(
-        Column("sweep", overflow="fold"),
-        "from … to",
-        "Γ/g",
-        *short,
-        title=title,
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
+        Column("sweep", overflow="fold"), "from … to", "Γ/g", *short, title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     rows = list[list[str]]()
     for sweep in plan.sweeps:

@@ -109,10 +109,11 @@ def wired_text(
     if bus is not None:
         link["bus"] = edited.in_line(bus)
     if serial:
-        edited.content["serial"] = serial
+        edited.content["serial"] = edited.scalar(serial)
         edited.content.yaml_add_eol_comment("assumed: the serial of the first drive", "serial")
     if arm.model_path is not None:
-        edited.content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+        model = os.path.relpath(arm.model_path, out.resolve().parent)
+        edited.content["kinematics"]["model"] = edited.scalar(model)
     return _annotated(edited.text, notes, "" if bus is None else NO_BUS), findings
 
 
@@ -154,13 +155,10 @@ def _rate(row: Any, match: Match, notes: list[str]) -> list[SetupFinding]:
     else:
         what, doubtful = f"has a torque field that ends at {rated:g} N·m", rated < before
         notes += ["rated_torque assumed: the end of the drive's torque field"] * doubtful
-    if not doubtful:
-        return []
-    remedy = "check that this drive moves this joint" + (
-        "" if match.by_hand else " (--by-hand finds the drive of each joint)"
-    )
+    by_hand = "" if match.by_hand else " (--by-hand finds the drive of each joint)"
     what = f"the drive {what}, but the joint was to have a rated torque of {before:g} N·m"
-    return [SetupFinding("warning", what, f"{match.joint} ({drive.address})", remedy)]
+    where, remedy = f"{match.joint} ({drive.address})", f"check that this drive moves this joint{by_hand}"
+    return [SetupFinding("warning", what, where, remedy)] if doubtful else []
 
 
 def _row_comments(text: str) -> list[list[str]]:
@@ -176,10 +174,9 @@ def _row_comments(text: str) -> list[list[str]]:
 def _annotated(text: str, notes: Sequence[Sequence[str]], outdated: str) -> str:
     """The text with these comments below the joints' rows, in place of those there, and without a comment that is
     `outdated`."""
-    lines = text.splitlines()
+    lines = text.splitlines(keepends=True)
     rows = EditedYaml(text).content["link"]["joints"]
     for row, known, new in reversed(list(zip(rows, _row_comments(text), notes, strict=True))):
         start = row.lc.line + 1
-        lines[start : start + len(known)] = [yaml_comment(note, row.lc.col + 2) for note in new]
-    kept = [line for line in lines if not (outdated and line.lstrip().startswith(f"# {outdated}"))]
-    return "\n".join(kept) + "\n"
+        lines[start : start + len(known)] = [f"{yaml_comment(note, row.lc.col + 2)}\n" for note in new]
+    return "".join(line for line in lines if not (outdated and line.lstrip().startswith(f"# {outdated}")))

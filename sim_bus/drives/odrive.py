@@ -9,12 +9,7 @@ from armlink.bus.port import REMOTE
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import (
-    BUS_VOLTAGE,
-    MOTOR_TEMPERATURE,
-    STAGE_TEMPERATURE,
-    SimulatedDrive,
-)
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
 TURN = 2 * math.pi

@@ -34,7 +34,7 @@ class Supervision:
         self.operational = bytearray(drives.n)
         """Whether each joint's node may use PDOs."""
         self.due = math.inf
-        self.watches_rpdos = False
+        self.watches_rpdos = self._watches_sync = False
         self._periods: dict[Timer, float] = {}
         self._due: dict[Timer, float] = {}
         """When each running timer is due [s]."""
@@ -82,7 +82,8 @@ class Supervision:
                 self._due.pop(timer, None)
         others = {timer: period for timer, period in self._periods.items() if timer[0] != place}
         self._periods = others | {timer: period for timer, period in wanted.items() if period}
-        self.watches_rpdos = any(kind == RPDO_TIMEOUT for _, kind, _ in self._periods)
+        kinds = {kind for _, kind, _ in self._periods}
+        self.watches_rpdos, self._watches_sync = RPDO_TIMEOUT in kinds, SYNC_LOST in kinds
         if own not in self._due:
             self._start(own, time)
         self._schedule()
@@ -97,7 +98,7 @@ class Supervision:
         self._start((joint, RPDO_TIMEOUT, number), time)
 
     def sync(self, time: float) -> None:
-        for node in self._nodes.values():
+        for node in self._nodes.values() if self._watches_sync else ():
             if not node.unplugged:
                 self._start((node.place, SYNC_LOST, 0), time)
 
@@ -129,8 +130,9 @@ class Supervision:
     def _start(self, timer: Timer, time: float) -> None:
         period = self._periods.get(timer)
         if period is not None:
-            self._due[timer] = time + period
-            self.due = min(self.due, time + period)
+            self._due[timer] = due = time + period
+            if due < self.due:
+                self.due = due
 
     def _schedule(self) -> None:
         self.due = min(self._due.values(), default=math.inf)

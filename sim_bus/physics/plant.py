@@ -257,7 +257,7 @@ class Plant:
             mujoco.mj_step(model, data, count)
             return
         slope, gears = (end - start) / count, self._gears
-        level, began = start + 0.5 * slope, self.motor_velocity
+        level, began = start + 0.5 * slope, self.motor_velocity if self.averages else 0.0
         for place in range(count):
             data.ctrl[:] = level if self._motors is None else self._asked(level, duration / count)
             if not self._steady_friction:

@@ -17,11 +17,12 @@ import numpy as np
 
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile
-from armlink.commands.plain_console import first_check, suggest
 from armlink.content.atomic_file import writing
+from armlink.commands.plain_console import command_line, suggest
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
+from armlink.loop.open import first_check
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
@@ -89,7 +90,7 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
     Demo(bench, seed, data, account).run()
     account.write(out, f"simulated arm {arm.name} with the hidden true values of seed {seed}")
-    suggest(first_check(arm, arm_name) if Path(arm_name).suffix else "armlink new MODEL.urdf --out my-arm.yaml")
+    suggest(command_line(*first_check(arm, arm_name)) if Path(arm_name).suffix else "armlink new MODEL.urdf")
 
 
 def quick(arm: ArmFile) -> ArmFile:

@@ -9,12 +9,7 @@ from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 
 TRAITS = Traits(
-    torque="link",
-    calibration="controller",
-    silence="holds",
-    bounds=("torque", "window"),
-    cadence="sync",
-    frame="11",
+    torque="link", calibration="controller", silence="holds", bounds=("torque", "window"), cadence="sync", frame="11"
 )
 """Of a drive with our torque sensor record."""
 TYPES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "real32": "f"}

@@ -37,12 +37,7 @@ class Units:
     """One encoder increment at the joint [rad]: the resolution of position readings."""
 
 
-def units_from(
-    rated_torque_mnm: int,
-    encoder: tuple[int, int],
-    gear: tuple[int, int],
-    feed: tuple[int, int],
-) -> Units:
+def units_from(rated_torque_mnm: int, encoder: tuple[int, int], gear: tuple[int, int], feed: tuple[int, int]) -> Units:
     """Scales by CiA 402 from 6076h [mN·m], 608Fh (increments, motor revolutions), 6091h (motor, shaft revolutions) and
     6092h (feed, shaft revolutions): user units = increments · 6092 / (608F · 6091), so 6092h is user units per joint
     revolution.

@@ -79,12 +79,13 @@ def _tell(
 ) -> int:
     """Findings, what was written and the next command, to the screen and as JSON; the exit status."""
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import first_check, results, suggest
+    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.loop.open import first_check
     from calib.commissioning.drive_match import addresses
 
     console = results(json_file)
     show_findings(console, findings)
-    step = first_check(arm, str(out))
+    step = command_line(*first_check(arm, str(out)))
     console.print(f"{out} is written with {len(matches)} drives: {addresses([each.drive for each in matches])}{more}")
     suggest(step)
     joints = [

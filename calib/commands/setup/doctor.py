@@ -25,7 +25,8 @@ def doctor(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, first_check, results, suggest
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
+    from armlink.loop.open import first_check
     from calib.commissioning.doctor import examine
 
     console = results(json_file)
@@ -39,6 +40,6 @@ def doctor(
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to correct first")
     else:
         console.print("no errors")
-        suggest(first_check(load_arm(arm), arm, bus))
+        suggest(command_line(*first_check(load_arm(arm), arm, bus), bus=bus))
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [vars(each) for each in findings]})
     return 1 if errors else 0

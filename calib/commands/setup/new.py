@@ -91,17 +91,11 @@ def new(
     """
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, command_line, first_check, results, suggest
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.loop.open import first_check
     from armlink.model_file import expanded
-    from calib.commands.setup.bus_setup import (
-        begin_with_drives,
-        bus_keys,
-        exit_status,
-        open_named,
-        rewire,
-        search,
-    )
+    from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
     from calib.commissioning.wiring import drives_have_ids
@@ -171,7 +165,7 @@ def new(
     arm = made.parsed()
     made.write()
     _show(results(json_file), made, arm)
-    step = command_line("demo", arm=out) if bus is None else first_check(arm, str(out))
+    step = command_line("demo", arm=out) if bus is None else command_line(*first_check(arm, str(out)))
     suggest(step)
     write_json(json_file, _answer(made, arm, step))
     return exit_status(made.findings)

@@ -201,13 +201,13 @@ def test_on_another_bus_it_asks_first(capsys):
 @pytest.mark.parametrize(
     ("arm", "says", "never"),
     [
-        ("sarcos", ("quick-stopped", "for 100 ms", "heartbeat", "hold, in quick stop"), ("lowered", "link.park")),
+        ("sarcos", ("quick-stopped", "for 100 ms", "heartbeat", "hold, in quick stop"), ("lowered", "parked")),
         (
             "six-damiao",
-            ("up to 300 ms", "every joint falls free (damiao)", "moves to link.park"),
+            ("up to 300 ms", "wrist_3: falls (damiao)", "parked or slowly lowered"),
             ("quick", "heartbeat"),
         ),
-        ("six-moteus", ("every joint sinks, damped (moteus)",), ("quick", "heartbeat")),
+        ("six-moteus", ("wrist_3: damps (moteus)",), ("quick", "heartbeat")),
     ],
 )
 def test_it_announces_what_it_tests_of_these_drives(arm, says, never, capsys):
@@ -220,10 +220,8 @@ def test_it_announces_what_it_tests_of_these_drives(arm, says, never, capsys):
 def test_the_joints_of_a_mixed_arm_are_named_by_what_their_drives_do():
     content = yaml.safe_load(bundled_arms()["six-damiao"].read_text())
     content["link"]["joints"][0] |= {"drive": {"family": "canopen", "node": 99}}
-    del content["link"]["park"]
     announced = announcement(parse_arm(content, Path("mixed.yaml")))
-    assert "base: holds (canopen); shoulder, elbow, wrist_1, wrist_2, wrist_3: falls free (damiao)" in announced
-    assert "the arm is slowly lowered" in announced
+    assert "base: holds (canopen); shoulder, elbow, wrist_1, wrist_2, wrist_3: falls (damiao)" in announced
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,14 @@
 """The text of a drafted arm file: names come back as they are, and nothing in one becomes a line of the file."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from armlink.arm_file import load_arm
+from armlink.arm_file import SIMULATED, Bus, load_arm
 from armlink.cli import run
 from armlink.content.file_content import parse_yaml
 from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry, yaml_item
@@ -16,6 +17,7 @@ from armlink.errors import BadInput
 from calib.commissioning.draft import Draft, JointDraft, arm_text
 from calib.commissioning.drive_match import Match
 from calib.commissioning.drive_match import _text as bus_text
+from calib.commissioning.wiring import wired_text
 
 NAMES = [
     "on", "null", "12", "1e3", "2026-01-01", "a, b", "joint: 1", "#1", "Gelenk_ü", "'", '"', "a: {b: [c", "*a", "&a",
@@ -59,9 +61,30 @@ def test_no_text_from_outside_adds_to_the_file(name, other, note):
     assert content["kinematics"]["stops"] == {name: [-1.0, 1.0], "j-2.a": [-1.0, 1.0]}
     assert (content["kinematics"]["base"], content["kinematics"]["tip"]) == (other, other)
     assert set(content["link"]) == {"bus", "rate", "joints"}
-    assert content["link"]["bus"] == {"interface": "armlink_sim", "channel": "arm.yaml", "bitrate": 1000000}
     assert (content["name"], content["serial"]) == (name, name)
     assert content.get("sweep", {"hold": "servo"}) == {"hold": "servo"}
+
+
+@settings(deadline=None, max_examples=50, derandomize=True)
+@given(TEXTS.filter(lambda name: name != "j-2.a"), TEXTS, TEXTS)
+def test_no_text_of_a_drive_or_bus_adds_to_the_file_or_changes_the_rest(name, other, note):
+    before = arm_text(drafted(name, other, note), Path("/nowhere/arm.yaml"))
+    arm = SimpleNamespace(require_link=lambda: SimpleNamespace(bus=Bus(interface=SIMULATED)), model_path=None)
+    matches = [
+        Match(each, FoundDrive("acme", 7 + place, other, {"id": 7 + place, "model": name}, note=note), by_hand=False)
+        for place, each in enumerate([name, "j-2.a"])
+    ]
+    bus = {"interface": other, "channel": name, "bitrate": 1}
+    text, _ = wired_text(before, arm, matches, Path("/nowhere/arm.yaml"), bus, other)
+    content, kept = yaml.safe_load(text), yaml.safe_load(before)
+    assert content["link"]["bus"] == bus
+    assert content["serial"] == (other or kept["serial"])
+    for place, (row, old) in enumerate(zip(content["link"]["joints"], kept["link"]["joints"], strict=True)):
+        del old["node"]
+        assert row == old | {"drive": {"family": "acme", "id": 7 + place, "model": name}}
+    for each in (content, kept):
+        del each["serial"], each["link"]["bus"], each["link"]["joints"]
+    assert content == kept
 
 
 @settings(deadline=None, max_examples=100, derandomize=True)
