@@ -281,24 +281,35 @@ def _solved(grams: Array, sides: Array) -> Array:
     return np.asarray(scale * np.linalg.solve(scaled, (scale * sides)[..., None])[..., 0])
 
 
+def fold_sums(
+    slopes: Iterable[Array], residual: Array, weight: Array, fold: Index
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Array, Array]:
+    """Squares and products of normal equations, squares of the residuals and weights, of each channel and fold.
+
+    Derivatives of each channel's residual (k, N), residuals (C, N), weights of rows (C, N), fold of each row (N,).
+    """
+    members = [np.flatnonzero(fold == f) for f in range(int(fold.max()) + 1)]
+    squares, products = list[Array](), list[Array]()
+    for x, y, w in zip(slopes, residual, weight, strict=False):
+        squares.append(np.stack([(x[:, m] * w[m]) @ x[:, m].T for m in members]))
+        products.append(np.stack([x[:, m] @ (w[m] * y[m]) for m in members]))
+    totals, counts = (np.stack([z[:, m].sum(1) for m in members], axis=1) for z in (weight * residual**2, weight))
+    return tuple(squares), tuple(products), totals, counts
+
+
 def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
     """Normal equations about a point; `folds` is the fold of each block."""
-    fold, count = folds[problem.block], int(folds.max()) + 1
     variance = scale_of(problem, about.residual)
     weight = problem.weight * robust_weight(about.residual, variance, problem.freedom)
-    members = [np.flatnonzero(fold == f) for f in range(count)]
-    squares, products = [], []
-    for c, x in enumerate(about.slopes):
-        squares.append(np.stack([(x[:, m] * weight[c, m]) @ x[:, m].T for m in members]))
-        products.append(np.stack([x[:, m] @ (weight[c, m] * about.residual[c, m]) for m in members]))
-    own = weight * about.residual**2
-    totals, counts = (np.stack([y[:, m].sum(1) for m in members], axis=1) for y in (own, problem.weight))
+    fold = folds[problem.block]
+    squares, products, totals, _ = fold_sums(about.slopes, about.residual, weight, fold)
+    counts = fold_sums((), problem.weight, problem.weight, fold)[3]
     away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
     return LinearTerms(
         about.theta,
         about.acting,
-        tuple(squares),
-        tuple(products),
+        squares,
+        products,
         totals,
         counts,
         variance,

@@ -24,8 +24,8 @@ ALIKE = 1e-6
 a rival of the cheaper one, too."""
 NEAR = 0.3
 """A rival within this is fitted about itself, if the columns of either depend on the other."""
-TRIED = 4
-"""Number of rivals, or of laws, tried in place of a term: the best of a first screening."""
+TRIED, LAWS_TRIED = 4, 3
+"""Number of rivals, and of laws, tried in place of a term: the best of a first screening."""
 SEPARATING_MOTION = {
     frozenset(
         {"friction.coulomb", "friction.load"}
@@ -165,7 +165,7 @@ class LawTest:
         for term in own:
             rest = choice.without(term, rest)
         laws = [law for law in self.laws if not all(self._is_case(term, law) for term in own)]
-        for law in choice.shortlist(rest, laws, TRIED):
+        for law in choice.shortlist(rest, laws, LAWS_TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
             best = min(best, StandIn(worse, law.effect), key=lambda each: each.worse)

@@ -18,12 +18,10 @@ from sim_gap.residuals.channel_quality import Disturbance, spectrum
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, PreparedSignals
-from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import FEWEST, ResidualSet, root_mean_square
 
 AT_REST = 0.05
 """Share of motion in the filter's window below which a joint is at rest; above, and without sliding, it creeps."""
-FEWEST = 25
-"""Number of samples from which a regime is judged."""
 LOWEST_PEAK_HZ = 1.5 * BAND_HZ
 """Frequency from which peaks are looked for [Hz]."""
 PEAK_HEIGHT = 8.0

@@ -58,6 +58,8 @@ hundredths are a tenth of all it does."""
 RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 """Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
 against motor."""
+FEWEST = 25
+"""Samples from which a row is looked at, or a regime of it."""
 FOLDS = 6
 """Number of folds for cross-validation, of all recordings together."""
 MOVING_SHARE = 0.95

@@ -80,8 +80,8 @@ class Term:
 
 
 CONSTANT, MASSES, BODY = "actuator.gain", "link.mass_moment", "link.payload"
-"""What recordings of motor torque alone know only up to a factor that all have in common: with links twice as heavy and
-every torque constant twice as large, the drives report the same."""
+"""Recordings of motor torque alone know these only up to a common factor: with links twice as heavy and every torque
+constant twice as large, the drives report the same."""
 
 
 def shares_a_factor(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
