@@ -41,8 +41,7 @@ from sim_gap.checks.check import (
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
-from sim_gap.model.known_gains import KnownGains
-from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
+from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import without_disturbances
 from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets

@@ -10,7 +10,7 @@ from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.rivals import AS_GOOD
 from sim_gap.attribution.verdict import row_rms
-from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import LAWS
 from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.disregarded_rows import AROUND_S
 from sim_gap.residuals.layout import Row

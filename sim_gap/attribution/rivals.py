@@ -1,6 +1,6 @@
 """Rivals of a cause: other effects that explain the recordings as well, and the motion that would separate them.
 
-General laws (effects/laws.py) represent effects that the library lacks: a cause is tested against them, too.
+General laws (effects/registry.py) represent effects that the library lacks: a cause is tested against them, too.
 """
 
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
 from sim_gap.search.term import CONSTANT, MASSES, Term, masses_may_be_constants

@@ -197,7 +197,8 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return form.reshaped(free, minimum_between(lambda value: fit(form.reshaped(free, value)), low, high))
 
         size = term.shape[free]
-        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
+        forms = [Term(*term.key, shape) for shape in term.form.hints.forms(term.shape) if shape != term.shape]
+        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in forms)]
         out[out.index(term)] = min(trials, key=fit)
     return out
 

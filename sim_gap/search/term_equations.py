@@ -86,11 +86,11 @@ class TermEquations:
             forms.setdefault(term.key, set()).add(term)
         out = {}
         for term in self.terms:
-            gone = {term.key, *term.covers(self.layout)}
+            gone = {term.key, *term.form.hints.covers(self.layout, term.place)}
             excluded = frozenset(other for key in gone for other in forms.get(key, ()) if other != term)
             needs, simpler = (
                 tuple(other for key in keys for other in forms.get(key, ()))
-                for keys in (term.beneath, term.alternatives(self.layout))
+                for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
             price = 0.0 if term.effect in usual or likely.every_joint else self.price(term)
