@@ -224,9 +224,9 @@ class ResidualSet:
         That is smaller for the motor against the sensor, in which errors of the links do not show.
         """
         torque, least = self.usual_torque, self.relevant_nm
-        return {row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], least) for row in self.rows}
+        return {row: 2.0 * self.floor[row] + max(self.relevant(row) * torque[row[1]], least) for row in self.rows}
 
-    def _relevant(self, row: Row) -> float:
+    def relevant(self, row: Row) -> float:
         """Smallest relevant gap in this row, as a share of the joint's torque."""
         reference = self.layout.reference(row)
         if reference is None:

@@ -1,7 +1,7 @@
 """Model selection: search the library, search again if simpler effects may suffice, refine the shapes."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -194,7 +194,11 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
-            return form.reshaped(free, minimum_between(lambda value: fit(form.reshaped(free, value)), low, high))
+            options = {"xatol": SHAPE_ACCURACY * (high - low)}
+            own = minimize_scalar(
+                lambda x: fit(form.reshaped(free, x)), bounds=(low, high), method="bounded", options=options
+            )
+            return form.reshaped(free, float(own.x))
 
         size = term.shape[free]
         forms = [Term(*term.key, shape) for shape in term.form.hints.forms(term.shape) if shape != term.shape]
@@ -241,9 +245,3 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
                     best[other] = score, other.relinearised(choice.values(terms)[other])
         offered = [best[term][1] if term in best else term for term in offered]
     return offered
-
-
-def minimum_between(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function is least between two values, to SHAPE_ACCURACY of their distance."""
-    accuracy = SHAPE_ACCURACY * (high - low)
-    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": accuracy}).x)
