@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from gcomp.arrays import Array
+from gcomp.estimate.exchange import AS_GOOD
 from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.column_store import ColumnStore
@@ -111,8 +112,6 @@ def _farthest(inside: Array, end: Array, matrix: Matrix) -> Array:
 
 AGREED = 5e-3
 """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
-WORSE = 1e-3
-"""Increase of the score from which a step is halved."""
 SLOW = 0.5
 """Change of a step, as a share of the last one's, from which derivatives are evaluated again."""
 STEPS, HALVINGS = 10, 3
@@ -138,7 +137,7 @@ def converge(
         equations = TermEquations(nominal.at(values, slopes=slopes), terms)
         now = score(equations, values)
         halved = 0
-        while values and now > best + WORSE and halved < HALVINGS:
+        while values and now > best + AS_GOOD and halved < HALVINGS:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
             equations = TermEquations(nominal.at(values, slopes=slopes), terms)
             now, halved = score(equations, values), halved + 1

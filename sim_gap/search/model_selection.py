@@ -11,7 +11,7 @@ from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import SYSTEMATIC
+from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge, fitted
 from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
@@ -133,8 +133,6 @@ AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
 row's residual, what no model has can mimic an effect up to the share SYSTEMATIC."""
 SHAPES = 3
 """Number of shapes of an effect at one place that are evaluated about the estimate."""
-SHAPE_ACCURACY = 0.01
-"""Accuracy of a shape, as a share of the distance of its neighbours on the grid."""
 ROUNDS = 3
 """How often the library is searched again about the estimate."""
 
@@ -194,7 +192,7 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
-            options = {"xatol": SHAPE_ACCURACY * (high - low)}
+            options = {"xatol": SHAPE_STEP * (high - low)}
             own = minimize_scalar(
                 lambda x: fit(form.reshaped(free, x)), bounds=(low, high), method="bounded", options=options
             )

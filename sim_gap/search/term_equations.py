@@ -19,8 +19,6 @@ CORRELATED = 8.0
 MOST_MEASUREMENTS = 333.0
 """Independent measurements that a row counts for at most: with the price of a parameter, this is a fall of its RMS by
 1 %, which what no model has can mimic however long the recording is."""
-LARGEST = 0.999
-"""Quantile of the absolute torques that is taken for the largest."""
 
 
 class TermEquations:
@@ -167,7 +165,7 @@ class Rated:
         self.joint = of_motor * np.stack([arm.frictionloss, arm.damping, arm.armature])
         """Friction, damping and armature of the nominal model, (3, n): a sensor on the link reads none of them."""
         self.speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
-        parts = [largest(s.model) + np.max([largest(x) for x in s.reading.values()], axis=0) for s in data.signals]
+        parts = [np.abs(s.model).max(0) + np.abs([*s.reading.values()]).max((0, 1)) for s in data.signals]
         self.torque = np.asarray(np.max(parts, axis=0))
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
 
@@ -179,7 +177,3 @@ class Rated:
         speed = float(self.speed[term.place])
         own = self.values.get(term.key)
         return Ratings(friction, damping, armature, speed, torque, self.tip_mass, self.mass, dry, own)
-
-
-def largest(torque: Array) -> Array:
-    return np.asarray(np.quantile(np.abs(torque), LARGEST, axis=0))
