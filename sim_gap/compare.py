@@ -17,8 +17,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import checked_recordings
 from sim_gap.checks.check import is_position_only
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.model.known_gains import KnownGains
-from sim_gap.model.load import SimModel
+from sim_gap.model.load import KnownGains, SimModel
 from sim_gap.position_gap.fit import residuals, root_mean_squares
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.training.export import widen_ranges

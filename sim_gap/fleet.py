@@ -18,7 +18,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from armlink.content.atomic_file import writing
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
-from sim_gap.model.known_gains import parse_known_gains
+from sim_gap.model.load import parse_known_gains
 
 CONNECT_SECONDS = 10.0
 """Longest wait for a scheduler to answer [s]."""

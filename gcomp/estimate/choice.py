@@ -67,11 +67,11 @@ class LinearTerms:
     none."""
     prior: Array
     """Inverse variance of each parameter before any measurement, (K,)."""
-    expected: Array | None = None
-    """Expected change of a parameter that is free, (K,); as `away` if it is not given."""
-    low: Array | None = None
-    """Least change of each parameter, (K,); no bound if it is not given."""
-    high: Array | None = None
+    expected: Array
+    """Expected change of a parameter that is free, (K,)."""
+    low: Array
+    high: Array
+    """Least and largest change of each parameter, (K,)."""
     _found: dict[frozenset[int], tuple[Array, Array]] = field(default_factory=dict)
     _fits: dict[frozenset[int], tuple[Index, Array]] = field(default_factory=dict)
 
@@ -113,15 +113,13 @@ class LinearTerms:
         whole, right = gram.sum(0), side.sum(0)
         grams, sides = np.concatenate([whole - gram, whole[None]]), np.concatenate([right - side, right[None]])
         grams[:, np.arange(size), np.arange(size)] += self.prior[index]
-        sides += self.prior[index] * np.nan_to_num(self.away if self.expected is None else self.expected)[index]
+        sides += self.prior[index] * self.expected[index]
         self._fits[free] = index, self._bounded(index, grams, sides)
         return self._fits[free]
 
     def _bounded(self, index: Index, grams: Array, sides: Array) -> Array:
         """Solutions of normal equations (F + 1, p, p) within the bounds: what the whole would have beyond is held there
         in all of them, and the others are fitted beside it."""
-        if self.low is None or self.high is None:
-            return _solved(grams, sides)
         low, high = self.low[index], self.high[index]
         held = low == high
         values = np.broadcast_to(np.where(held, low, 0.0), sides.shape).copy()
@@ -147,8 +145,6 @@ class LinearTerms:
 
     def at_bounds(self, change: Array) -> Index:
         """Parameters whose change (K,) is a bound that leaves room on the other side."""
-        if self.low is None or self.high is None:
-            return np.zeros(0, np.intp)
         return np.flatnonzero((self.low < self.high) & ((change <= self.low) | (change >= self.high)))
 
     def left(self, change: Array, fold: int | None = None) -> Array:
@@ -218,7 +214,7 @@ class LinearTerms:
             if len(index) and self.counts[c].any():
                 gram[index[:, None], index] += self.squares[c].sum(0) / self.variance[c]
                 side[index] -= self.products[c].sum(0) / self.variance[c]
-        return gram, side + self.prior * np.nan_to_num(self.away if self.expected is None else self.expected)
+        return gram, side + self.prior * self.expected
 
     def curvature(self, own: Index, free: Iterable[int]) -> Array:
         """Second derivatives of the cost in some parameters, all other free ones adapting, (p, p)."""
@@ -248,15 +244,12 @@ class LinearTerms:
             own = np.array([candidates[k] for k in same.tolist()], np.intp)
             blocks = gram[own[:, :, None], own[:, None, :]] + floor[own][:, :, None] * np.eye(width)
             aim = left[own]
-            if self.low is not None and self.high is not None:
-                low, high = self.low[own], self.high[own]
-                held = low == high
-                fixed = np.where(held, low, 0.0)
-                beside = np.where(held, fixed, aim - (blocks @ fixed[..., None])[..., 0])
-                free_blocks = np.where(held[:, :, None] | held[:, None, :], np.eye(width), blocks)
-                values = np.clip(np.linalg.solve(free_blocks, beside[..., None])[..., 0], low, high)
-            else:
-                values = np.linalg.solve(blocks, aim[..., None])[..., 0]
+            low, high = self.low[own], self.high[own]
+            held = low == high
+            fixed = np.where(held, low, 0.0)
+            beside = np.where(held, fixed, aim - (blocks @ fixed[..., None])[..., 0])
+            free_blocks = np.where(held[:, :, None] | held[:, None, :], np.eye(width), blocks)
+            values = np.clip(np.linalg.solve(free_blocks, beside[..., None])[..., 0], low, high)
             out[same] = np.sum(values * (aim - 0.5 * (blocks @ values[..., None])[..., 0]), axis=1)
         return out
 
@@ -281,31 +274,35 @@ def _solved(grams: Array, sides: Array) -> Array:
     return np.asarray(scale * np.linalg.solve(scaled, (scale * sides)[..., None])[..., 0])
 
 
+def fold_sums(
+    slopes: Iterable[Array], residual: Array, weight: Array, fold: Index
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Array, Array]:
+    """Squares and products of normal equations, squares of the residuals and weights, of each channel and fold.
+
+    Derivatives of each channel's residual (k, N), residuals (C, N), weights of rows (C, N), fold of each row (N,).
+    """
+    members = [np.flatnonzero(fold == f) for f in range(int(fold.max()) + 1)]
+    squares, products = list[Array](), list[Array]()
+    for x, y, w in zip(slopes, residual, weight, strict=False):
+        squares.append(np.stack([(x[:, m] * w[m]) @ x[:, m].T for m in members]))
+        products.append(np.stack([x[:, m] @ (w[m] * y[m]) for m in members]))
+    totals, counts = (np.stack([z[:, m].sum(1) for m in members], axis=1) for z in (weight * residual**2, weight))
+    return tuple(squares), tuple(products), totals, counts
+
+
 def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
     """Normal equations about a point; `folds` is the fold of each block."""
-    fold, count = folds[problem.block], int(folds.max()) + 1
     variance = scale_of(problem, about.residual)
     weight = problem.weight * robust_weight(about.residual, variance, problem.freedom)
-    members = [np.flatnonzero(fold == f) for f in range(count)]
-    squares, products = [], []
-    for c, x in enumerate(about.slopes):
-        squares.append(np.stack([(x[:, m] * weight[c, m]) @ x[:, m].T for m in members]))
-        products.append(np.stack([x[:, m] @ (weight[c, m] * about.residual[c, m]) for m in members]))
-    own = weight * about.residual**2
-    totals, counts = (np.stack([y[:, m].sum(1) for m in members], axis=1) for y in (own, problem.weight))
+    fold = folds[problem.block]
+    squares, products, totals, _ = fold_sums(about.slopes, about.residual, weight, fold)
+    counts = fold_sums((), problem.weight, problem.weight, fold)[3]
     away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
+    unbounded = np.full(len(away), np.inf)
     return LinearTerms(
-        about.theta,
-        about.acting,
-        tuple(squares),
-        tuple(products),
-        totals,
-        counts,
-        variance,
-        problem.floor,
-        away,
-        precision(problem),
-    )
+        about.theta, about.acting, squares, products, totals, counts, variance, problem.floor, away,
+        precision(problem), np.nan_to_num(away), -unbounded, unbounded,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

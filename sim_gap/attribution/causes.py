@@ -12,7 +12,7 @@ from sim_gap.attribution.diagnosis import HINT, Cause, Signs
 from sim_gap.attribution.rivals import LawTest, Rivals
 from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
-from sim_gap.residuals.layout import ChannelLayout, Row
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term
@@ -132,9 +132,9 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
     return "link.payload" if inertia_of_payload else term.effect
 
 
-MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
-"""Share of a joint's torque (RMS) by which a cause must lower some joint's RMS not to be minor: if it shows against the
-model, only in motor against sensor, only in command against motor."""
+MINOR = 0.6
+"""Share of the smallest relevant gap of the rows in which it shows by which a cause must lower some joint's RMS not to
+be minor."""
 WITHIN_NM = 0.08
 """Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
 could explain them."""
@@ -156,7 +156,7 @@ def relevant_terms(
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
     absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
-    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, absolute)
+    least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
     others = [term for term in estimate.terms if term not in step.terms]
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
     falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
@@ -180,15 +180,6 @@ def relevant_terms(
     return tuple(term for term in step.terms if term.place not in small) or step.terms
 
 
-def _minor(shows: set[Row], layout: ChannelLayout) -> Array:
-    """Share of each joint's torque below which a cause that shows in these rows is minor, (n,)."""
-    if any(channel == layout.against_model for channel, _ in shows):
-        return np.full(layout.n, MINOR)
-    inner = {channel for channel, _ in shows} == {layout.command}
-    beyond = [layout.beyond(joint) > 0 for joint in range(layout.n)]
-    return np.where(beyond, MINOR_INNER, MINOR_COMMAND) if inner else np.full(layout.n, MINOR_INNER)
-
-
 def causes(
     estimate: EffectEstimate,
     heldout: ResidualSet,
@@ -199,8 +190,7 @@ def causes(
     """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
 
     If all rows are `within` their margins, noise could explain everything: a cause that may be nothing, by its own
-    intervals, is minor, too, and one that is a guess, even where general laws
-    or rivals that share its evidence would do as well.
+    intervals, is minor, too, and so is a guess without rivals, which would share its evidence.
     """
     found: list[Cause] = []
     minor: list[Cause] = []

@@ -41,24 +41,19 @@ from sim_gap.checks.check import (
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
-from sim_gap.model.known_gains import KnownGains
-from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
+from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import without_disturbances
-from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, prepare, require_length
+from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.model_selection import select_model
+from sim_gap.search.model_selection import ROUNDS, select_model
 from sim_gap.search.term_equations import TermChoice
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
-OWN_HELDOUT_S = 3.0
-"""Least length of it [s], up to half of a short recording."""
 LENT = "since no training recording shows the body that it carries or lacks, and the first half was used for the fit"
 """Why half of a held-out recording is fitted."""
-MOUNTED = 2
-"""How often the ways in which a body is mounted are looked at."""
 
 
 def diagnose(
@@ -172,7 +167,7 @@ def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, Eff
     """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
     search = select_model(ColumnStore(fit), library)
     estimate = EffectEstimate(search.equations.store, search.current)
-    for _ in range(MOUNTED):
+    for _ in range(ROUNDS):
         signals = estimate.store.data.signals
         angles = mounts(estimate)
         if angles == tuple(s.mount for s in signals):
@@ -244,7 +239,7 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
     first, last = [], []
     for recording in recordings:
         span = recording.t[-1] - recording.t[0]
-        cut = recording.t[-1] - max(OWN_HELDOUT * span, min(OWN_HELDOUT_S, 0.5 * span))
+        cut = recording.t[-1] - max(OWN_HELDOUT * span, min(SHORTEST_S, 0.5 * span))
         moved = times_in_motion(recording)
         if len(moved):
             cut = min(cut, max(float(np.quantile(moved, 1.0 - OWN_HELDOUT)), recording.t[0] + SHORTEST_PIECE_S))

@@ -8,8 +8,9 @@ from gcomp.arrays import Array
 from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
+from sim_gap.attribution.rivals import AS_GOOD
 from sim_gap.attribution.verdict import row_rms
-from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import LAWS
 from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.disregarded_rows import AROUND_S
 from sim_gap.residuals.layout import Row
@@ -21,8 +22,6 @@ from sim_gap.search.term import CONSTANT, MASSES, masses_may_be_constants, share
 
 WORSE = 1.1
 """Gap with the corrections over the one without them from which the corrections do not carry over; a choice."""
-ALIKE = 0.05
-"""A general law that scores worse than a cause by less than this is noted."""
 
 
 def notes(
@@ -160,7 +159,7 @@ def _alike(found: Sequence[Cause]) -> tuple[str, ...]:
         f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may not be "
         "in the library"
         for cause in found
-        if cause.signs.outside < ALIKE
+        if cause.signs.outside < AS_GOOD
     )
 
 

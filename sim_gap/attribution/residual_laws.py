@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
+from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.residuals.disregarded_rows import regimes_left_out, slides
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+from sim_gap.search.term_equations import CORRELATED, MOST_MEASUREMENTS
 
 KNOTS = 8
 """Number of points between which a law is linear."""
@@ -30,13 +32,8 @@ SMALLEST = 0.02
 """Least range of a quantity for a law of it, in its unit."""
 FEWEST = 100
 """Number of samples from which a law is fitted."""
-CLEARLY = 0.95
-"""Mean square that a law leaves, as a share of an earlier one's, from which it is taken instead: the order is that of
-velocity, position, load, temperature, time."""
 WARM_UPS = (6.0, 20.0, 60.0, 200.0)
 """Time constants of laws of time [s]."""
-DEVIATIONS = 2.0
-"""Half the width of the band about a law, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +136,12 @@ def _best(
 ) -> ResidualLaw | None:
     """The law that predicts left-out parts of the training residual best, if it holds on the held-out data."""
     (mask, judged), joint = masks, row[1]
-    best, chosen = np.inf, None
+    measurements = min(mask.sum() / CORRELATED, MOST_MEASUREMENTS)
+    best, chosen = np.inf, None  # velocity is tried first, then position, load, temperature, time
     for law in _candidates(fit.signals, joint, row[0] == fit.layout.motor_side):
         x = np.concatenate([law.columns(s, joint) for s in fit.signals])
         missed = _cross_validated(x[mask], left[0][mask], fit.folds[mask])
-        if missed < CLEARLY * best:
+        if missed < np.exp(-2.0 * PRICE / measurements) * best:
             best, chosen = missed, (law, x)
     if chosen is None:
         return None
@@ -155,7 +153,7 @@ def _best(
     if before**2 - after**2 < LEAST * above or before - after < judge.relevant_nm:
         return None
     at = law.basis(law.at)
-    band = DEVIATIONS * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))
+    band = SIGNIFICANT * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))
     return ResidualLaw(law.quantity, joint, row[0], law.directed, law.at, at @ c, band, before, after)
 
 

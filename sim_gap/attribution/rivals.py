@@ -1,6 +1,6 @@
 """Rivals of a cause: other effects that explain the recordings as well, and the motion that would separate them.
 
-General laws (effects/laws.py) represent effects that the library lacks: a cause is tested against them, too.
+General laws (effects/registry.py) represent effects that the library lacks: a cause is tested against them, too.
 """
 
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
 from sim_gap.search.term import CONSTANT, MASSES, Term, masses_may_be_constants
@@ -24,8 +24,8 @@ ALIKE = 1e-6
 a rival of the cheaper one, too."""
 NEAR = 0.3
 """A rival within this is fitted about itself, if the columns of either depend on the other."""
-TRIED = 4
-"""Number of rivals, or of laws, tried in place of a term: the best of a first screening."""
+TRIED, LAWS_TRIED = 4, 3
+"""Number of rivals, and of laws, tried in place of a term: the best of a first screening."""
 SEPARATING_MOTION = {
     frozenset(
         {"friction.coulomb", "friction.load"}
@@ -165,7 +165,7 @@ class LawTest:
         for term in own:
             rest = choice.without(term, rest)
         laws = [law for law in self.laws if not all(self._is_case(term, law) for term in own)]
-        for law in choice.shortlist(rest, laws, TRIED):
+        for law in choice.shortlist(rest, laws, LAWS_TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
             best = min(best, StandIn(worse, law.effect), key=lambda each: each.worse)

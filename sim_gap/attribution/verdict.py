@@ -52,8 +52,6 @@ def features(signs: Signs) -> dict[str, float]:
 
 NEAR, ROW_LEFT = 2.0, 0.15
 """Most that may remain of a row: this many times its margin, or this share of its RMS."""
-CARRIES = 0.3
-"""Fall of the gap by a cause that carries the explanation, as a share of that of the most important one."""
 
 
 def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
@@ -91,8 +89,9 @@ def is_closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
 
 
 def carries(cause: Cause, found: Sequence[Cause]) -> bool:
-    """Whether a cause carries the explanation: a good part of what the most important one takes off is lost without."""
-    return cause.fall >= CARRIES * max(each.fall for each in found)
+    """Whether a cause carries the explanation: without it, more of what the most important one takes off is lost than
+    an explanation may leave."""
+    return cause.fall >= EXPLAINED * max(each.fall for each in found)
 
 
 def verdict(

@@ -15,6 +15,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
+from gcomp.estimate.choice import SIGNIFICANT
 from sim_gap.checks.column_pairs import follows_position, require_commands, sound_velocity
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
@@ -27,8 +28,6 @@ from sim_gap.residuals.preprocess import CHANNELS, SHORTEST_S, PreparedSignals, 
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
-SIGNAL = 2.0
-"""Standard deviation of a reading over that of its noise from which it holds a signal."""
 LEAST_RANGE = 0.1
 """Range from which a joint moves [rad]."""
 LEAST_SHARE = 0.01
@@ -146,7 +145,9 @@ def _with_right_columns(
     for channel in CHANNELS:
         while channel in s.channels and len(found) < 2 * arm.n:
             motion = motion_of(s, channel)
-            if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # of an arm that swings, its drives off
+            if bool(
+                (motion.reading.std(0) < SIGNIFICANT * s.noise[channel]).all()
+            ):  # of an arm that swings, its drives off
                 break
             finding = find_wrong_columns(arm, motion, stated, follows_position(recording), known)
             if finding is None or finding.option in {each.option for each in found}:

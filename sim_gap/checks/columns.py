@@ -100,7 +100,7 @@ def find_wrong_columns(
 
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
-    """What the cost falls by with each hypothesis, less the price, on some of the rows, (M,)."""
+    """Fall of the cost by each hypothesis, less the price, on some of the rows, (M,)."""
     few = slice(None, None, max(1, len(motion.q) // SCREENING_ROWS))
     changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
     moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]

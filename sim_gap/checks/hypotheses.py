@@ -10,6 +10,7 @@ import numpy as np
 
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from gcomp.arrays import Array
+from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
 from sim_gap.checks.sound_arm import ChannelMotion, measurements
 from sim_gap.model.rigid_body import RigidArm
@@ -24,8 +25,6 @@ UNIT_FACTORS = np.geomspace(1e-3, 2e3, 32)
 """Numbers that may be recorded of one newton metre: a torque constant with a gear or without, mA."""
 ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
-SIGN_FITS = 4
-"""Fits after which the signs of amounts and the torque that they tell agree."""
 POSITION_CHOICES = 4
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
 LEAST_SIGN_SHARE = 0.1
@@ -264,7 +263,7 @@ def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:
     amount = np.abs(motion.reading[:, joint])
     columns = np.stack([model, way, motion.v[:, joint], np.ones_like(way)], axis=1)
     predicted = model if motion.channel == "tau" else model + np.median(amount) * way
-    for _ in range(SIGN_FITS):
+    for _ in range(REWEIGHINGS):  # after which signs and the torque that they tell agree
         signed = amount * np.sign(predicted)
         predicted = columns @ np.linalg.lstsq(columns, signed, rcond=None)[0]
     reading = motion.reading.copy()

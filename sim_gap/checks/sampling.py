@@ -137,8 +137,7 @@ def _roughness(t: Array, position: Array) -> float:
 
 def drop_repeats(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording without rows that repeat the one before while the arm moves."""
-    columns = np.column_stack(list(recording.channels().values()))
-    same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
+    same = _repeats(np.column_stack(list(recording.channels().values())))
     moving = fast_rows(recording.position)
     share = float(same[moving].mean()) if moving.any() else 0.0
     if share < REPEATED:
@@ -204,7 +203,7 @@ def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
 
 def _repeats(values: Array) -> Mask:
     """Rows in which all columns repeat the row before, (K,)."""
-    return np.concatenate([[False], np.all(values[1:] == values[:-1], axis=1)])
+    return np.concatenate([[False], np.all((values[1:] == values[:-1]) | ~np.isfinite(values[1:]), axis=1)])
 
 
 def fill(t: Array, values: Array, known: Mask) -> Array:

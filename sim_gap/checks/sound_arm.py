@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms
-from gcomp.estimate.problem import Index
+from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms, fold_sums
 from sim_gap.checks.joint_range import beyond_range
 from sim_gap.model.rigid_body import INERTIAL, RigidArm
 from sim_gap.residuals.preprocess import PreparedSignals
+from sim_gap.residuals.residual_set import FOLDS
 
 ROWS = 1500
 """Rows that are looked at."""
@@ -81,8 +81,6 @@ function of the pose; most of a recording."""
 LEAST_TORQUE_SHARE = 0.1
 """Errors of a joint that carries next to nothing, over those of the one that carries most: sensors, cables and tools
 pull at a slim wrist, too."""
-FOLDS = 6
-"""Parts of a recording of which each is held out once."""
 LOAD_DISTANCE_STD = 0.2
 """Standard deviation of the distance of a load from the last joint, over the arm's length."""
 LOAD_GYRATION = 0.5
@@ -267,22 +265,16 @@ def _fit(
     spread = np.concatenate([own_spread.ravel(), shared_spread])
     read = np.cumsum(np.isfinite(motion.reading).any(1))
     fold = np.maximum(read - 1, 0) * FOLDS // read[-1]
-    rows = np.stack([telling[fold == f].sum(0) for f in range(FOLDS)], axis=1)
-    each = measurements(motion) / np.maximum(rows.sum(1), 1) * np.broadcast_to(counted, n)
-    acting, squares, products = list[Index](), list[Array](), list[Array]()
-    totals = np.zeros((n, FOLDS))
-    for j in range(n):
-        x, y = np.vstack([own[j], shared[:, j]]), reading[j]
-        acting.append(np.concatenate([np.arange(j * width, (j + 1) * width), n * width + np.arange(len(shared))]))
-        parts = [(fold == f) & telling[:, j] for f in range(FOLDS)]
-        squares.append(np.stack([each[j] * x[:, p] @ x[:, p].T for p in parts]))
-        products.append(np.stack([-each[j] * x[:, p] @ y[p] for p in parts]))
-        totals[j] = [each[j] * float(y[p] @ y[p]) for p in parts]
+    weight = telling.T * (measurements(motion) / np.maximum(telling.sum(0), 1) * counted)[:, None]
+    alone, common = np.arange(width), n * width + np.arange(len(shared))
+    acting = tuple(np.concatenate([j * width + alone, common]) for j in range(n))
+    columns = (-np.vstack([own[j], shared[:, j]]) for j in range(n))
+    squares, products, totals, counts = fold_sums(columns, reading, weight, fold)
     floor = LEAST_RESIDUAL * np.maximum(motion.size, SMALLEST_TORQUE)
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(
-        none, tuple(acting), tuple(squares), tuple(products), totals, rows * each[:, None], floor**2, floor, none,
+        none, acting, squares, products, totals, counts, floor**2, floor, none,
         1.0 / spread**2, none, low, high,
     )  # fmt: skip
     every = range(len(spread))

@@ -33,7 +33,7 @@ def compare(
     from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
     from sim_gap.compare import compare_models
-    from sim_gap.model.known_gains import parse_known_gains
+    from sim_gap.model.load import parse_known_gains
 
     if len(sim) < 2:
         raise BadInput("--sim: give two or more models")

@@ -100,7 +100,7 @@ def diagnose(
     from armlink.extras import require_extra
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
-    from sim_gap.model.known_gains import parse_known_gains
+    from sim_gap.model.load import parse_known_gains
     from sim_gap.report.effect_text import sentence
 
     console = PlainConsole()

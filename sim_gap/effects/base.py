@@ -6,13 +6,12 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import InverseEffect, Plausibility, SearchHints, Shape, Signature
+from sim_gap.model.rigid_body import POSITION_STEP
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
 TILT_DEVIATION = 1.0
 """Prior standard deviation of an angle of the tilt [rad]: a base may stand on a wall."""
-STEP = 1e-6
-"""Step of the differences in a rotation [rad]."""
 LARGE = 0.3
 """Tilt from which the search also starts [rad]."""
 
@@ -39,9 +38,9 @@ def tilt_gravity(gravity: Array, angles: Array) -> Array:
 
 def _slopes(gravity: Array, angles: Array) -> Array:
     """Derivative of `tilt_gravity` in the two angles, (3, 2)."""
-    steps = STEP * np.eye(2)
+    steps = POSITION_STEP * np.eye(2)
     return np.stack([tilt_gravity(gravity, angles + d) - tilt_gravity(gravity, angles - d) for d in steps], axis=-1) / (
-        2 * STEP
+        2 * POSITION_STEP
     )
 
 

@@ -22,9 +22,6 @@ from sim_gap.effects.effect import (
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
-ROTOR = 1.0
-"""Usual size of a reflected rotor inertia, as a share of the stretched arm's inertia about its base: geared drives are
-matched to their load within a factor of some."""
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
 
@@ -70,7 +67,8 @@ EFFECTS = (
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
         Plausibility(
             every_joint=True,
-            prior_std=lambda signals, _place: ROTOR * signals.arm.stretched_inertia,
+            # geared drives are matched to their load within a factor of some
+            prior_std=lambda signals, _place: signals.arm.stretched_inertia,
             bounds=lambda ratings, _shape: (-ratings.armature, np.inf),
         ),
     ),

@@ -10,7 +10,8 @@ from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, Ra
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 
-SIX = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+SIX = np.triu_indices(3)
+"""Entries of a symmetric matrix in the order of INERTIAL."""
 LIGHT_KG = 1e-6
 """Least absolute mass of which a centre is taken [kg]."""
 
@@ -75,10 +76,8 @@ LEVER = 0.15
 """Plausible shift of a link's centre of mass [m], and radius of gyration of added mass [m]."""
 LIGHTEST = 0.2
 """Least mass of a link [kg] for judging the plausible error of its inertials."""
-SEVERAL = 6
-"""With up to this number of training recordings, a payload may be in one of them alone."""
 FEW = 4
-"""With up to this number, in any of them."""
+"""With up to this number of training recordings, a payload may be in any of them."""
 SHOWS = 0.3
 """A mass moment's own torque must be at least this share of the torque of the inertia that comes with it."""
 TAKEN = 0.98
@@ -148,14 +147,13 @@ def shape_of(chosen: Iterable[int]) -> Shape:
 
 
 def _recordings(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...]:
-    """In all recordings, in those of a group, or without groups in one of several or (of a few) in any but not all."""
+    """In all recordings, in those of a group, or without groups, of a few, in any but not all."""
     groups = {name: {s.number for s in signals if name in s.groups} for s in signals for name in s.groups}
     if groups:
         return ((), *dict.fromkeys(shape_of(each) for each in groups.values()))
     known = sorted({s.number for s in signals} - {0})
-    most = len(known) - 1 if len(known) <= FEW else 1
-    some = most if 1 < len(known) <= SEVERAL else 0
-    return ((), *(shape_of(each) for size in range(1, some + 1) for each in combinations(known, size)))
+    sizes = range(1, len(known)) if len(known) <= FEW else ()
+    return ((), *(shape_of(each) for size in sizes for each in combinations(known, size)))
 
 
 def _tip_mass_moment(layout: ChannelLayout, _place: int) -> tuple[Key, ...]:

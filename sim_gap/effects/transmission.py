@@ -7,7 +7,6 @@ for backlash half the play, in the direction of the transmitted torque.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
@@ -26,8 +25,6 @@ from sim_gap.residuals.preprocess import PreparedSignals
 
 ALWAYS, MOST, SLOWLY = 24, 64, 0.25
 """Most cycles per radian of a ripple that is searched for: in any case, and if a joint turns slowly enough."""
-SMOOTH_HZ = 10.0
-"""Pass band of the transmitted torque before its acceleration is taken."""
 NOISY = 0.05
 """Largest noise of a sensor, as a share of the joint's torque (RMS), for its reading to be used."""
 SETTLED = 0.02
@@ -97,9 +94,7 @@ def transmitted(signals: PreparedSignals, layout: ChannelLayout, joint: int) -> 
     """
     model, sensor = signals.model[:, joint], layout.sensor
     clear = sensor and signals.noise[sensor][joint] < NOISY * np.sqrt(np.mean(model**2))
-    torque = signals.reading[sensor][:, joint] if sensor and clear else model
-    cut = min(SMOOTH_HZ, 0.4 * signals.rate)
-    return np.asarray(sosfiltfilt(butter(4, cut, fs=signals.rate, output="sos"), torque))
+    return signals.calm(signals.reading[sensor][:, joint] if sensor and clear else model)
 
 
 def _bend(signals: PreparedSignals, layout: ChannelLayout, place: int) -> Array:

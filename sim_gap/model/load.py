@@ -12,9 +12,65 @@ from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
 from gcomp.arm.inertials import inertial_of
 from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
-from sim_gap.model.known_gains import KnownGains, put_gains
+from gcomp.arrays import Array
 from sim_gap.model.rigid_body import RigidArm, Tendons
 from sim_gap.model.solver_friction import creep_speeds
+
+
+@dataclass(frozen=True, eq=False)
+class KnownGains:
+    """Gains by joint, (n,) each; one value for all is (1,)."""
+
+    kp: Array
+    """[N·m/rad]"""
+    kd: Array
+    """[N·m·s/rad]"""
+
+    def of_joints(self, count: int) -> "KnownGains":
+        """The same for so many joints. Raises BadInput where there are values for another number."""
+        for name, values in (("kp", self.kp), ("kd", self.kd)):
+            if len(values) not in (1, count):
+                raise BadInput(
+                    f"--gains {name}: {len(values)} values for {count} joints: give one value, or one for each joint"
+                )
+        return replace(self, **{name: np.resize(x, count) for name, x in (("kp", self.kp), ("kd", self.kd))})
+
+
+def parse_known_gains(text: str) -> KnownGains | None:
+    """Read `kp=20,kd=1.5` or `kp=20;20;30,kd=1;1;1.5`; None for an empty text. Raises BadInput."""
+    if not text:
+        return None
+    found: dict[str, Array] = {}
+    for part in text.split(","):
+        name, _, values = part.strip().partition("=")
+        try:
+            numbers = np.array([float(value) for value in values.split(";")])
+        except ValueError:
+            numbers = np.array([np.nan])
+        positive = bool(np.all(np.isfinite(numbers) & (numbers >= 0.0))) and (name != "kp" or bool(np.all(numbers > 0)))
+        if name not in ("kp", "kd") or name in found or not positive:
+            raise BadInput(f"--gains {part.strip()}: expected kp=VALUE,kd=VALUE in N·m/rad and N·m·s/rad, or kp=A;B;…")
+        found[name] = numbers
+    if "kp" not in found:
+        raise BadInput(f"--gains {text}: kp is missing: give kp=VALUE,kd=VALUE")
+    return KnownGains(found["kp"], found.get("kd", np.zeros(1)))
+
+
+def put_gains(spec: Any, joints: Sequence[int], gains: KnownGains) -> None:
+    """Give joints of a compiled `mujoco.MjSpec` position actuators with these gains in place of what drives them."""
+    import mujoco
+
+    for j, joint in enumerate(joints):
+        name = spec.joints[joint].name
+        old = [a for a in spec.actuators if a.target == name and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+        limits = [list(a.forcerange) for a in old if a.forcerange[0] < a.forcerange[1]]
+        called = old[0].name if old else f"position_{name}"
+        for actuator in old:
+            spec.delete(actuator)
+        made = spec.add_actuator(name=called, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made.set_to_position(kp=float(gains.kp[j]), kv=float(gains.kd[j]))
+        if limits:
+            made.forcelimited, made.forcerange = 1, limits[0]
 
 
 def ends_of(source: Any) -> tuple[str | None, str | None]:
@@ -296,7 +352,9 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
 
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     adr, dof = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
-    flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | _WITHOUT_CONTACT
+    bits = mujoco.mjtDisableBit
+    without = int(bits.mjDSBL_CONSTRAINT) | int(bits.mjDSBL_CONTACT) | int(bits.mjDSBL_LIMIT)
+    flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | without
     kept = (model.dof_frictionloss, model.tendon_frictionloss, model.body_gravcomp)  # the last is the controller's
     losses = [(loss, loss.copy()) for loss in kept]
     for loss, _ in losses:
@@ -321,6 +379,3 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
         model.opt.disableflags = flags
         for loss, was in losses:
             loss[:] = was
-
-
-_WITHOUT_CONTACT = 1 | (1 << 4) | (1 << 3)  # mjDSBL_CONSTRAINT, CONTACT, LIMIT

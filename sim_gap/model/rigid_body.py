@@ -130,17 +130,8 @@ class RigidArm:
                 couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
         return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
 
-    def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
-        """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
-        motion = self.motion(q, v, a, gravity)
-        return np.moveaxis(np.stack([self._of_link(motion, j) for j in range(self.n)], axis=1), -1, 0)
-
     def link_regressor(self, motion: LinkMotion, link: int) -> Array:
         """Columns of `torque` in the ten inertial parameters of one link, (K, n, 10); zero where it is not carried."""
-        return np.moveaxis(self._of_link(motion, link), -1, 0)
-
-    def _of_link(self, motion: LinkMotion, link: int) -> Array:
-        """The same, (n, 10, K)."""
         turns, moves = motion
         rows = moves[link][0].shape[1]
         out = np.zeros((self.n, 10, rows))
@@ -153,7 +144,7 @@ class RigidArm:
             down = np.einsum("ijk,ljk->ilk", down, turns[i])
             lever = lever + np.einsum("ijk,j->ik", down, self.offset[i])
             i = self.parent[i]
-        return out
+        return np.moveaxis(out, -1, 0)
 
     def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> LinkMotion:
         """How the links move, from base to tip."""

@@ -18,12 +18,8 @@ from sim_gap.residuals.channel_quality import Disturbance, spectrum
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, PreparedSignals
-from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import FEWEST, MOVING_SHARE, ResidualSet, root_mean_square
 
-AT_REST = 0.05
-"""Share of motion in the filter's window below which a joint is at rest; above, and without sliding, it creeps."""
-FEWEST = 25
-"""Number of samples from which a regime is judged."""
 LOWEST_PEAK_HZ = 1.5 * BAND_HZ
 """Frequency from which peaks are looked for [Hz]."""
 PEAK_HEIGHT = 8.0
@@ -43,7 +39,7 @@ def regimes_left_out(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
             continue
         known = np.concatenate([_known(data, s, row) for s in data.signals])
         aside = known & ~data.valid[row] & ~_hit(data)
-        still = share[:, joint] < AT_REST
+        still = share[:, joint] < 1.0 - MOVING_SHARE  # above, and without sliding, it creeps
         out[row, "rest"], out[row, "creep"] = aside & still, aside & ~still
     return out
 

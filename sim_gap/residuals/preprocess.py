@@ -111,7 +111,11 @@ class PreparedSignals:
     @cached_property
     def smooth_model(self) -> Array:
         """Nominal torque without the noise of the accelerations, which would disturb plays and clips, (K, n)."""
-        return low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
+        return self.calm(self.model)
+
+    def calm(self, torque: Array) -> Array:
+        """A torque (K, …) without what disturbs plays, clips and its acceleration."""
+        return low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(torque)
 
     @property
     def passed_on(self) -> Array:

@@ -58,6 +58,8 @@ hundredths are a tenth of all it does."""
 RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 """Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
 against motor."""
+FEWEST = 25
+"""Samples from which a row is looked at, or a regime of it."""
 FOLDS = 6
 """Number of folds for cross-validation, of all recordings together."""
 MOVING_SHARE = 0.95
@@ -222,9 +224,9 @@ class ResidualSet:
         That is smaller for the motor against the sensor, in which errors of the links do not show.
         """
         torque, least = self.usual_torque, self.relevant_nm
-        return {row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], least) for row in self.rows}
+        return {row: 2.0 * self.floor[row] + max(self.relevant(row) * torque[row[1]], least) for row in self.rows}
 
-    def _relevant(self, row: Row) -> float:
+    def relevant(self, row: Row) -> float:
         """Smallest relevant gap in this row, as a share of the joint's torque."""
         reference = self.layout.reference(row)
         if reference is None:

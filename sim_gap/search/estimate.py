@@ -19,7 +19,7 @@ NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
 at a link, up to WORST."""
 SHAPE_STEP = 1e-2
-"""Step of the differences in a shape, as a share of it."""
+"""Step of the differences in a shape, as a share of it; accuracy to which it is found between its neighbours."""
 LEAST_LEVER_M = 0.01
 """Least distance of a link's centre of mass from its joint's axis [m] for judging errors of its moment."""
 SYSTEMATIC = 0.3

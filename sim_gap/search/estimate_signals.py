@@ -5,7 +5,7 @@ nominal model's; a Gauss-Newton step evaluates them about the last estimate (`si
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,52 +43,44 @@ class EstimateSignals:
         return self.stages[_stage(term)] if term.form.signature.side == "distortion" else self.signals
 
 
-@dataclass(eq=False)
-class _Parts:
-    """The chain from link to motor as it is built up."""
-
-    signals: PreparedSignals
-    shares: dict[Term, Columns] = field(default_factory=dict)
-
-    def add(self, term: Term, rows: Columns) -> None:
-        self.shares[term] = rows
-
-
 def signals_about(read: PreparedSignals, layout: ChannelLayout, values: Values) -> EstimateSignals:
     """A recording about an estimate; about nothing, the recording itself."""
-    parts = _Parts(read)
-    bodies = _bodies(parts, layout, values) if values else read.bodies
-    springs = _springs(parts, layout, values)
+    shares = dict[Term, Columns]()
+    s, bodies = _bodies(read, layout, values, shares) if values else (read, read.bodies)
+    springs = read.arm.spring_torque(read.q)  # the nominal model's at the positions that were read
+    for term, c in values.items():
+        if term.form.signature.side == "link" and term not in shares:
+            _add_to(springs, layout.against_model, _share(shares, s, layout, term, c))
     still = Found(read, bodies + springs, np.zeros_like(read.q), np.zeros_like(read.q), springs)
-    s = replace(parts.signals, found=still) if values else read
-    parts.signals = s
+    s = replace(s, found=still) if values else read
     lost, bent = np.zeros_like(read.q), np.zeros_like(read.q)
     for term, c in values.items():
         if term.form.signature.side == "motor":
-            _add_to(lost, layout.motor_side, _share(parts, s, layout, term, c))
+            _add_to(lost, layout.motor_side, _share(shares, s, layout, term, c))
     stages: list[PreparedSignals] = []
     for stage in range(len(STAGES)):
         entering = replace(s, found=replace(still, bent=bent.copy())) if bent.any() else s
         stages.append(entering)
         for term, c in values.items():
             if term.form.signature.side == "distortion" and _stage(term) == stage:
-                _add_to(bent, layout.sensor, _share(parts, entering, layout, term, c))
+                _add_to(bent, layout.sensor, _share(shares, entering, layout, term, c))
     if values:
         s = replace(s, found=replace(still, lost=lost, bent=bent))
     for term, c in values.items():
-        if term not in parts.shares:
-            parts.add(term, {row: x @ c for row, x in _columns(s, layout, term).items()})
-    return EstimateSignals(s, parts.shares, *_gains(s, values), tuple(stages))
+        if term not in shares:
+            _share(shares, s, layout, term, c)
+    return EstimateSignals(s, shares, *_gains(s, values), tuple(stages))
 
 
 def _stage(term: Term) -> int:
     return next(k for k, effects in enumerate(STAGES) if term.effect in effects)
 
 
-def _share(parts: _Parts, s: PreparedSignals, layout: ChannelLayout, term: Term, c: Array) -> Columns:
-    rows = {row: x @ c for row, x in _columns(s, layout, term).items()}
-    parts.add(term, rows)
-    return rows
+def _share(shares: dict[Term, Columns], s: PreparedSignals, layout: ChannelLayout, term: Term, c: Array) -> Columns:
+    """Torque that a term adds to the rows [N·m], (K,) each, which joins the others' shares."""
+    columns = term.form.signature.columns(s, layout, term.place, term.shape)
+    shares[term] = {row: x @ c for row, x in columns.items()}
+    return shares[term]
 
 
 def _add_to(total: Array, channel: str | None, rows: Columns) -> None:
@@ -98,13 +90,12 @@ def _add_to(total: Array, channel: str | None, rows: Columns) -> None:
             total[:, joint] += share
 
 
-def _columns(s: PreparedSignals, layout: ChannelLayout, term: Term) -> Columns:
-    return term.form.signature.columns(s, layout, term.place, term.shape)
-
-
-def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
-    """Torque of the links about the estimate (K, n); shares of the terms that change it: masses, gravity, positions."""
-    read, channel = parts.signals, layout.against_model
+def _bodies(
+    read: PreparedSignals, layout: ChannelLayout, values: Values, shares: dict[Term, Columns]
+) -> tuple[PreparedSignals, Array]:
+    """Signals and torque of the links about the estimate (K, n); shares of the terms that change it: masses, gravity,
+    positions."""
+    channel = layout.against_model
     arm, torque = read.arm, read.bodies
     ours = {term: c for term, c in values.items() if term.form.signature.side == "link"}
     inertial = arm.inertial.copy()
@@ -116,14 +107,14 @@ def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
             inertial[link] += change
             share = read.link_regressor(link) @ change
             torque = torque + share
-            parts.add(term, {(channel, int(j)): share[:, j] for j in np.flatnonzero(arm.carries[:, link])})
+            shares[term] = {(channel, int(j)): share[:, j] for j in np.flatnonzero(arm.carries[:, link])}
     arm = arm.with_inertial(inertial)
     for term, c in ours.items():
         if term.effect == "base.tilt":
             turned, still = tilt_gravity(arm.gravity, c), np.zeros_like(read.q)
             share = arm.torque(read.q, still, still, turned - arm.gravity)
             arm, torque = replace(arm, gravity=turned), torque + share
-            parts.add(term, {(channel, j): share[:, j] for j in range(arm.n)})
+            shares[term] = {(channel, j): share[:, j] for j in range(arm.n)}
     s = replace(read, arm=arm, found=Found(read, torque, np.zeros_like(read.q), np.zeros_like(read.q)))
     for term, c in ours.items():
         if term.form.signature.moves is not None:
@@ -133,22 +124,8 @@ def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
             before, torque = torque, arm.torque(q, v, a)
             share = torque - before
             s = replace(s, q=q, v=v, a=a, found=Found(read, torque, s.found.lost, s.found.bent) if s.found else None)
-            parts.add(term, {(channel, j): share[:, j] for j in range(arm.n)})
-    parts.signals = s
-    return torque
-
-
-def _springs(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
-    """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares.
-
-    The nominal model's own pull as they do at the positions that were read: shares are what the estimate adds.
-    """
-    read = parts.signals.read
-    total = read.arm.spring_torque(read.q)
-    for term, c in values.items():
-        if term.form.signature.side == "link" and term not in parts.shares:
-            _add_to(total, layout.against_model, _share(parts, parts.signals, layout, term, c))
-    return total
+            shares[term] = {(channel, j): share[:, j] for j in range(arm.n)}
+    return s, torque
 
 
 def inertial_change(term: Term, c: Array, inertial: Array, number: int) -> Array | None:

@@ -1,7 +1,7 @@
 """Model selection: search the library, search again if simpler effects may suffice, refine the shapes."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -11,7 +11,7 @@ from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import SYSTEMATIC
+from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge, fitted
 from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
@@ -133,8 +133,6 @@ AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
 row's residual, what no model has can mimic an effect up to the share SYSTEMATIC."""
 SHAPES = 3
 """Number of shapes of an effect at one place that are evaluated about the estimate."""
-SHAPE_ACCURACY = 0.01
-"""Accuracy of a shape, as a share of the distance of its neighbours on the grid."""
 ROUNDS = 3
 """How often the library is searched again about the estimate."""
 
@@ -194,10 +192,15 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
-            return form.reshaped(free, minimum_between(lambda value: fit(form.reshaped(free, value)), low, high))
+            options = {"xatol": SHAPE_STEP * (high - low)}
+            own = minimize_scalar(
+                lambda x: fit(form.reshaped(free, x)), bounds=(low, high), method="bounded", options=options
+            )
+            return form.reshaped(free, float(own.x))
 
         size = term.shape[free]
-        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
+        forms = [Term(*term.key, shape) for shape in term.form.hints.forms(term.shape) if shape != term.shape]
+        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in forms)]
         out[out.index(term)] = min(trials, key=fit)
     return out
 
@@ -240,9 +243,3 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
                     best[other] = score, other.relinearised(choice.values(terms)[other])
         offered = [best[term][1] if term in best else term for term in offered]
     return offered
-
-
-def minimum_between(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function is least between two values, to SHAPE_ACCURACY of their distance."""
-    accuracy = SHAPE_ACCURACY * (high - low)
-    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": accuracy}).x)

@@ -46,17 +46,6 @@ class Term:
         entries = [i for i in range(len(self.shape)) if i not in hints.discrete]
         return entries[0] if len(entries) == 1 and hints.linearised_at is None else None
 
-    @property
-    def forms(self) -> "tuple[Term, ...]":
-        shapes = self.form.hints.forms(self.shape)
-        return tuple(Term(self.effect, self.place, shape) for shape in shapes if shape != self.shape)
-
-    def covers(self, layout: ChannelLayout) -> tuple[Key, ...]:
-        return self.form.hints.covers(layout, self.place)
-
-    def alternatives(self, layout: ChannelLayout) -> tuple[Key, ...]:
-        return self.form.hints.alternatives(layout, self.place, self.shape)
-
     def relinearised(self, coefficients: Array) -> "Term":
         """The same term, linearised at its fitted size; unchanged if it is linear."""
         if self.form.hints.linearised_at is None:
@@ -80,8 +69,8 @@ class Term:
 
 
 CONSTANT, MASSES, BODY = "actuator.gain", "link.mass_moment", "link.payload"
-"""What recordings of motor torque alone know only up to a factor that all have in common: with links twice as heavy and
-every torque constant twice as large, the drives report the same."""
+"""Recordings of motor torque alone know these only up to a common factor: with links twice as heavy and every torque
+constant twice as large, the drives report the same."""
 
 
 def shares_a_factor(layout: ChannelLayout, terms: Sequence[Term]) -> bool:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, Effect, LinearTerms
+from gcomp.estimate.choice import PRICE, Effect, LinearTerms, fold_sums
 from gcomp.estimate.exchange import EffectChoice
 from sim_gap.effects.effect import Key, Ratings
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import FEWEST, ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.term import Term
 
@@ -19,10 +19,6 @@ CORRELATED = 8.0
 MOST_MEASUREMENTS = 333.0
 """Independent measurements that a row counts for at most: with the price of a parameter, this is a fall of its RMS by
 1 %, which what no model has can mimic however long the recording is."""
-FEWEST = 25
-"""Samples from which a row is looked at."""
-LARGEST = 0.999
-"""Quantile of the absolute torques that is taken for the largest."""
 
 
 class TermEquations:
@@ -46,27 +42,17 @@ class TermEquations:
         store.release()
 
     def _linear(self, data: ResidualSet, fewest: int) -> LinearTerms:
-        folds = int(data.folds.max()) + 1
-        shape = (len(self.rows), folds)
-        acting, squares, products = list[NDArray[np.intp]](), list[Array](), list[Array]()
-        totals, counts, power = np.zeros(shape), np.zeros(shape), np.zeros(self.size)
-        valid = {row: data.valid[row] for row in self.rows}
-        longest = max(max(int(mask.sum()) for mask in valid.values()), 1)
-        measurements = min(longest / CORRELATED, MOST_MEASUREMENTS)
-        for r, row in enumerate(self.rows):
-            touching = [term for term in self.terms if row in self.store.columns(term)]
-            index, x, y = self.index(touching), self.store.wide(touching, row, self.fixed), data.values[row]
-            seen = int(valid[row].sum())
-            each = measurements / seen if seen >= fewest else 0.0
-            gram, side = np.zeros((folds, len(index), len(index))), np.zeros((folds, len(index)))
-            for fold in range(folds):
-                pick = valid[row] & (data.folds == fold)
-                part, target = x[pick], y[pick]
-                gram[fold], side[fold] = each * part.T @ part, -each * part.T @ target
-                totals[r, fold], counts[r, fold] = each * float(target @ target), each * pick.sum()
-            acting.append(index)
-            squares.append(gram)
-            products.append(side)
+        valid = np.array([data.valid[row] for row in self.rows])
+        seen = valid.sum(1)
+        measurements = min(max(int(seen.max()), 1) / CORRELATED, MOST_MEASUREMENTS)
+        weight = valid * np.where(seen >= fewest, measurements / np.maximum(seen, 1), 0.0)[:, None]
+        touching = [[term for term in self.terms if row in self.store.columns(term)] for row in self.rows]
+        acting = tuple(self.index(terms) for terms in touching)
+        columns = (-self.store.wide(terms, row, self.fixed).T for terms, row in zip(touching, self.rows, strict=True))
+        residual = np.array([data.values[row] for row in self.rows])
+        squares, products, totals, counts = fold_sums(columns, residual, weight, data.folds)
+        power = np.zeros(self.size)
+        for index, gram in zip(acting, squares, strict=True):
             power[index] += np.diagonal(gram.sum(0)) / measurements
         floor = np.array([data.relevance_floor[row] for row in self.rows])
         spread, expected, low, high = (np.zeros(self.size) for _ in range(4))
@@ -82,7 +68,7 @@ class TermEquations:
         prior = 1.0 / spread**2 + 1e-9 * power + (power == 0.0)
         raw = totals.sum(1) / np.maximum(counts.sum(1), 1e-300)
         return LinearTerms(
-            np.zeros(self.size), tuple(acting), tuple(squares), tuple(products), totals, counts, raw + floor**2, floor,
+            np.zeros(self.size), acting, squares, products, totals, counts, raw + floor**2, floor,
             np.zeros(self.size), prior, expected, low, high,
         )  # fmt: skip
 
@@ -98,11 +84,11 @@ class TermEquations:
             forms.setdefault(term.key, set()).add(term)
         out = {}
         for term in self.terms:
-            gone = {term.key, *term.covers(self.layout)}
+            gone = {term.key, *term.form.hints.covers(self.layout, term.place)}
             excluded = frozenset(other for key in gone for other in forms.get(key, ()) if other != term)
             needs, simpler = (
                 tuple(other for key in keys for other in forms.get(key, ()))
-                for keys in (term.beneath, term.alternatives(self.layout))
+                for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
             price = 0.0 if term.effect in usual or likely.every_joint else self.price(term)
@@ -179,7 +165,7 @@ class Rated:
         self.joint = of_motor * np.stack([arm.frictionloss, arm.damping, arm.armature])
         """Friction, damping and armature of the nominal model, (3, n): a sensor on the link reads none of them."""
         self.speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
-        parts = [largest(s.model) + np.max([largest(x) for x in s.reading.values()], axis=0) for s in data.signals]
+        parts = [np.abs(s.model).max(0) + np.abs([*s.reading.values()]).max((0, 1)) for s in data.signals]
         self.torque = np.asarray(np.max(parts, axis=0))
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
 
@@ -191,7 +177,3 @@ class Rated:
         speed = float(self.speed[term.place])
         own = self.values.get(term.key)
         return Ratings(friction, damping, armature, speed, torque, self.tip_mass, self.mass, dry, own)
-
-
-def largest(torque: Array) -> Array:
-    return np.asarray(np.quantile(np.abs(torque), LARGEST, axis=0))

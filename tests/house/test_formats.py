@@ -20,7 +20,7 @@ from calib.motion.static_reading import StaticReading
 from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
-from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import LAWS
 from sim_gap.effects.registry import effects as inverse_effects
 from tests.house.conftest import keyed, part, rows
 

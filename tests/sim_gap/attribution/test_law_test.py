@@ -6,8 +6,7 @@ from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.rivals import LawTest
-from sim_gap.effects.laws import LAWS
-from sim_gap.effects.registry import effects, library_without
+from sim_gap.effects.registry import LAWS, effects, library_without
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare

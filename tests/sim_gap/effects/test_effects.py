@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.laws import LAWS
-from sim_gap.effects.registry import effects, library_without
+from sim_gap.effects.registry import LAWS, effects, library_without
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import Columns, layout_of
 from sim_gap.residuals.preprocess import prepare

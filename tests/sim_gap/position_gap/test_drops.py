@@ -11,8 +11,7 @@ from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.checks.check import check_position_only
-from sim_gap.model.known_gains import parse_known_gains
-from sim_gap.model.load import load_model
+from sim_gap.model.load import load_model, parse_known_gains
 
 COUNT = 2 * np.pi / 4096
 

@@ -16,7 +16,7 @@ from sim_gap.search import gauss_newton, model_selection
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import signals_about
-from sim_gap.search.feasibility import _closest, _positive, _shapes
+from sim_gap.search.gauss_newton import _closest, _positive, _shapes
 from sim_gap.search.model_selection import relinearised_in_place, select_model
 from sim_gap.search.term import Term
 
