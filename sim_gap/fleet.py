@@ -258,6 +258,9 @@ class Answers:
         self.found[case] = answer
 
 
+CAUSE_COLUMNS = ("effect", "joints", "shrink", "confidence", "confounded_with")
+
+
 def table(answers: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """One row per case and cause; a case without a cause has one row."""
     rows = []
@@ -268,15 +271,7 @@ def table(answers: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
             "verdict": answer.get("verdict", "failed"),
             "error": answer.get("error"),
         }
-        row |= {"effect": None, "joints": None, "shrink": None, "confidence": None, "confounded_with": None}
-        causes = answer.get("causes") or [{}]
-        for cause in causes:
-            columns = {
-                "effect": cause.get("effect"),
-                "joints": ", ".join(cause.get("joints", [])) or None,
-                "shrink": cause.get("shrink"),
-                "confidence": cause.get("confidence"),
-                "confounded_with": ", ".join(cause.get("confounded_with", [])) or None,
-            }
-            rows.append(row | columns)
+        for cause in answer.get("causes") or [{}]:
+            columns = {name: cause.get(name) for name in CAUSE_COLUMNS}
+            rows.append(row | {name: ", ".join(x) or None if isinstance(x, list) else x for name, x in columns.items()})
     return rows

@@ -10,7 +10,6 @@ from armlink.commands.options import Json, reads_recordings
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
-    from rich.table import Table
 
     from armlink.recording.corrections import Corrections
     from sim_gap.attribution.diagnosis import Diagnosis
@@ -205,38 +204,29 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
-    kind = "URDF" if path.suffix == ".urdf" else "MJCF"
-    if answer.unit == "rad":
-        from sim_gap.better_model.export import module_path
-        from sim_gap.position_gap.training.position_files import batch_path, module_model, write_exported
-
-        with_actuators = " with its position actuators" if kind == "MJCF" else ""
-        for line in write_exported(answer.internals, path):
-            console.print(f"not in {kind}: {line}", style="yellow")
-        console.print(f"corrected model{with_actuators}: {path}")
-        if batch_path(path).is_file():
-            console.print(f"the same model without PID actuators, for MuJoCo Warp: {batch_path(path)}")
-        if kind == "MJCF" and module_model(path).is_file():
-            console.print(
-                f"corrected model for use with {module_path(path)}, which applies its friction: {module_model(path)}"
-            )
-        return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.export import module_path, write_model
+    from sim_gap.position_gap.training.position_files import batch_path, module_model, write_exported
 
-    missing = write_model(
-        answer.internals.model, answer.internals.estimate, path, as_effects(answer.laws, answer.names)
-    )
+    made, positions, kind = answer.internals, answer.unit == "rad", "URDF" if path.suffix == ".urdf" else "MJCF"
+    if positions:
+        left_out, model = write_exported(made, path), module_model(path)
+    else:
+        left_out, model = write_model(made.model, made.estimate, path, as_effects(answer.laws, answer.names)), path
     console.print(f"corrected model: {path}")
-    for line in missing:
+    for line in left_out:
         console.print(f"not in {kind}: {line}", style="yellow")
-    if missing and module_path(path).is_file():
-        console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
+    if positions and batch_path(path).is_file():
+        console.print(f"the same model without PID actuators, for MuJoCo Warp: {batch_path(path)}")
+    if left_out and module_path(path).is_file() and model.is_file() and not (positions and kind == "URDF"):
+        console.print(f"{module_path(path)} applies effects that MJCF cannot hold in a MuJoCo simulation of {model}")
 
 
 def show(answer: "Diagnosis", console: "Console") -> None:
     """Print causes and gap as tables, then the notes."""
     from rich.table import Column, Table
+
+    from sim_gap.report.effect_text import parameter_rows
 
     if answer.causes:
         effect = Column("effect", no_wrap=True)
@@ -247,7 +237,11 @@ def show(answer: "Diagnosis", console: "Console") -> None:
             numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
             table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
         console.print(table)
-        console.print(_parameters(answer))
+        columns = "joint", "parameter", "value", Column("95 % interval", no_wrap=True), "unit"
+        table = Table(Column("effect", no_wrap=True), *columns, title="their parameters")
+        for row in (row for cause in answer.causes for row in parameter_rows(cause)):
+            table.add_row(*row)
+        console.print(table)
     table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
     for j, name in enumerate(answer.names):
         numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
@@ -255,18 +249,3 @@ def show(answer: "Diagnosis", console: "Console") -> None:
     console.print(table)
     for note in answer.notes:
         console.print(note, style="yellow")
-
-
-def _parameters(answer: "Diagnosis") -> "Table":
-    """The parameters of the causes with their 95 % intervals."""
-    from rich.table import Column, Table
-
-    effect, interval = Column("effect", no_wrap=True), Column("95 % interval", no_wrap=True)
-    table = Table(effect, "joint", "parameter", "value", interval, title="their parameters")
-    for cause in answer.causes:
-        for joint, values in cause.parameters.items():
-            for name, each in values.items():
-                unit = "" if each.unit == "1" else f" ({each.unit})"
-                between = f"{each.low:.3g} to {each.high:.3g}"
-                table.add_row(cause.effect, joint, name + unit, f"{each.value:.4g}", between)
-    return table

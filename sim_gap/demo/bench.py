@@ -79,11 +79,9 @@ class Bench:
     ) -> Recording:
         """Every cycle of a motion of its own, positions as the calibration corrects them; kept as MCAP too."""
         link, rows, low, high = self.link, list[Sample](), self.described.lower, self.described.upper
-        t = np.arange(int(seconds * link.rate)) * link.period
-        middle: Array = (low + high) / 2
-        reach: Array = RANGE_SHARE * (high - low) / 2
-        draw = np.random.default_rng(seed).random((link.n, 2, TONES))
-        targets = middle + multisine(t, reach, self.speed, TONE_BAND_HZ, draw)
+        t: Array = link.period * np.arange(int(seconds * link.rate), dtype=float)
+        draw, reach = np.random.default_rng(seed).random((link.n, 2, TONES)), RANGE_SHARE * (high - low) / 2
+        targets: Array = (low + high) / 2 + multisine(t, reach, self.speed, TONE_BAND_HZ, draw)
         self.travel(link.position_sent, targets[0])
         for k, target in enumerate(targets):
             rows.append(link.cycle(Command.hold(target)))

@@ -94,16 +94,11 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
 
 def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[Group]) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if beside a free rotor some joint's gain is loose: positions show ratios."""
-    terms, places = about.terms, about.layout.places
+    places = about.layout.places
     for j in range(search.data.joints):
         rotor = (j, "armature") in places and "actuator.rotor_inertia" not in search.excluded
-        if "kp" not in fit.at(j) or not rotor:
-            continue
-        free = sorted({k for k in about.parameters(chosen) if places[k][0] == j} | {places.index((j, "armature"))})
-        index = terms.acting[j].tolist()
-        at = [index.index(k) for k in free]
-        normal = terms.squares[j].sum(0)[np.ix_(at, at)] / terms.variance[j] + np.diag(terms.prior[free])
-        deviation = np.sqrt(np.linalg.pinv(normal, hermitian=True)[(k := free.index(places.index((j, "kp")))), k])
-        if deviation > LOOSE:
-            return ("actuator.rotor_inertia",)
+        if rotor and (j, "kp") in fit.free:
+            free = about.parameters(chosen) | {places.index((j, "armature"))}
+            if about.terms.curvature(np.array([places.index((j, "kp"))]), free)[0, 0] < 1.0 / LOOSE**2:
+                return ("actuator.rotor_inertia",)
     return ()

@@ -117,8 +117,6 @@ class Scales:
 LOGARITHMIC = ("kp", "stribeck_velocity", "gain")
 INVERSE = "limit", "slew"
 """Limits: their inverse is fitted, which is 0 where there is none."""
-ANYTHING = float(np.log(1e3))
-"""Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST_INVERSE = 1e-3
 """Inverse of a limit, over that of its usual size, below which there is none."""
 
@@ -139,14 +137,6 @@ def from_coordinate(name: str, x: Array, size: Array) -> Array:
     else:
         value = x * size
     return np.clip(value, PARAMETERS[name].low, PARAMETERS[name].high)
-
-
-def step_parameter(name: str, value: float, step: float, scales: Scales, joint: int) -> float:
-    """A parameter's value after a step in its own coordinate, within its bounds."""
-    size = float(scales.of(name)[joint])
-    if name in LOGARITHMIC:
-        step = float(np.clip(step, -ANYTHING, ANYTHING))
-    return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
 
 
 # ---- links and base

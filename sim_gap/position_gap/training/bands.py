@@ -55,7 +55,8 @@ def band(search: LoopSearch, fit: LoopFit, spread: Covariance, left: Array, held
     each = root_mean_squares(data, left)
     unexplained = joint_rms(data, each)
     size = np.sqrt(_variance(search, fit, spread, data) + unexplained[:, None] ** 2)
-    factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
+    there = data.weight > 0.0
+    factor = np.array([np.quantile((np.abs(left[:, j]) / size[:, j])[there[:, j]], SHARE) for j in range(data.joints)])
     wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
     if data.of_one_recording:
         wider *= 1.0 + (OTHER_MOTION - 1.0) * _lasting(left, data.weight) ** 2
@@ -63,7 +64,7 @@ def band(search: LoopSearch, fit: LoopFit, spread: Covariance, left: Array, held
     about = simulate(heldout, [fit.point, *_with_limits(fit, spread.limits)])
     unit = wider[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
     for j in range(data.joints) if len(about) > 1 else ():
-        gaps = (left[:, j] / size[:, j])[data.weight[:, j] > 0.0]
+        gaps = (left[:, j] / size[:, j])[there[:, j]]
         shown = heldout.weight[:, j] > 0.0
         factor[j] *= _narrower(gaps, about[:, :, j][:, shown] / unit[:, j][shown], float(factor[j]))
     half = factor[:, None] * unit
@@ -126,8 +127,3 @@ def _variance(search: LoopSearch, fit: LoopFit, spread: Covariance, data: Window
     _, slopes = jacobian(replace(search, data=data), fit.point, spread.names)
     each = [np.einsum("atw,ab,btw->tw", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
     return np.stack(each, axis=1)
-
-
-def _quantile(left: Array, size: Array, weight: Array) -> float:
-    """Multiple of `size` within which the share SHARE of the samples lies."""
-    return float(np.quantile((np.abs(left) / size)[weight > 0.0], SHARE))

@@ -26,7 +26,7 @@ def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> N
     write_rows(draw(found.search, found.fit, found.spread, count, seed, found.band.reach), path)
 
 
-def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
+def write_exported(found: Identified, path: Path) -> list[str]:
     """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
 
     If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. If it leaves out
@@ -39,8 +39,7 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     if found.export is None:
         raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     xml, beside = found.export.xml, {} if path.suffix == URDF else _beside(found, path)
-    made = write_files(path, found.sim, xml, lambda: mujoco.MjModel.from_xml_string(xml), found.export.lines, beside)
-    return tuple(made)
+    return write_files(path, found.sim, xml, lambda: mujoco.MjModel.from_xml_string(xml), found.export.lines, beside)
 
 
 def _beside(found: Identified, path: Path) -> dict[Path, str | None]:

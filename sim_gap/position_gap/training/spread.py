@@ -20,7 +20,7 @@ from gcomp.arrays import Array
 from gcomp.estimate.solve import LONGEST_STEP, precision
 from sim_gap.position_gap.fit import Layout, LoopFit, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.judge import LOOSE
-from sim_gap.position_gap.parameters import LOGARITHMIC, PARAMETERS, UNIT, WITH_TORQUE, range_of, step_parameter
+from sim_gap.position_gap.parameters import LOGARITHMIC, PARAMETERS, UNIT, WITH_TORQUE
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.position_gap.training.unreached_limits import Unreached, draw_limits
 from sim_gap.position_gap.windows import Windows
@@ -41,6 +41,8 @@ STATED = 0.5
 """Relative standard deviation of a value of SCALED that the model states and no fit has contradicted."""
 ALIKE = 0.9
 """Correlation of the errors of a value of SCALED that the model states for several joints."""
+ANYTHING = float(np.log(1e3))
+"""Logarithm of the factor to either side of a gain of which nothing is known."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
 LEAST_MOMENT = 1e-8
@@ -266,14 +268,13 @@ def interval(
             return value, limit.least, max(limit.most, value), PARAMETERS[name].unit
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
-    below, above = -half, half
-    if joint < 0:
-        value, (least, most) = float(fit.point[name][0]), range_of(search.arm, name)
-        return value, max(value + below, least), min(value + above, most), UNIT[name.partition(".")[2]]
-    value = float(fit.point[name][joint])
-    ends = (step_parameter(name, value, step, search.scales, joint) for step in (below, above))
-    low, high = sorted(ends)
-    return value, low, high, PARAMETERS[name].unit
+    half = min(half, ANYTHING) if name in LOGARITHMIC else half
+    layout = Layout(search, fit.point, [(joint, name)])
+    problem, about = layout.problem(), layout.theta(fit.point)
+    points = [fit.point, *(layout.at(problem.within(about + step)) for step in (-half, half))]
+    value, *ends = (float(point[name][max(joint, 0)]) for point in points)
+    unit = PARAMETERS[name].unit if joint >= 0 else UNIT[name.partition(".")[2]]
+    return value, min(ends), max(ends), unit
 
 
 def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> tuple[float, float, float, str]:

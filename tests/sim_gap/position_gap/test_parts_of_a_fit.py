@@ -15,7 +15,7 @@ from sim_gap.position_gap import fit as fitting
 from sim_gap.position_gap.choice import best_level, look_about, select
 from sim_gap.position_gap.fit import LoopFit, jacobian, residuals, rms_on
 from sim_gap.position_gap.identify import _frozen
-from sim_gap.position_gap.parameters import PARAMETERS, Scales, step_parameter
+from sim_gap.position_gap.parameters import PARAMETERS, Scales, from_coordinate, to_coordinate
 from sim_gap.position_gap.training import export, position_files, spread
 from sim_gap.position_gap.training import replay as replays
 from sim_gap.position_gap.windows import choose_windows, thin
@@ -162,18 +162,21 @@ def test_a_limit_is_tried_at_the_level_that_fits() -> None:
     assert level[0] == pytest.approx(0.45, rel=0.4)
 
 
+def moved(name: str, value: float, step: float) -> float:
+    """A parameter's value after a step in its own coordinate, where all sizes are 1."""
+    size = float(Scales(*np.ones((4, 1))).of(name)[0])
+    return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
+
+
 def test_a_spring_does_not_push_away_from_its_rest() -> None:
     """A negative one fits the range of one recording and nothing beyond."""
-    ones = np.ones(2)
-    assert step_parameter("spring", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) == 0.0
-    assert step_parameter("offset", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) < 0.0
+    assert moved("spring", 0.1, -50.0) == 0.0
+    assert moved("offset", 0.1, -50.0) < 0.0
 
 
 def test_a_limit_is_fitted_by_its_inverse_and_none_is_nothing() -> None:
-    ones = np.ones(2)
-    scales = Scales(ones, ones, ones, ones)
-    assert step_parameter("limit", 2.0, 0.5, scales, 0) == pytest.approx(1.0)
-    assert step_parameter("limit", 2.0, -0.5, scales, 0) == np.inf
+    assert moved("limit", 2.0, 0.5) == pytest.approx(1.0)
+    assert moved("limit", 2.0, -0.5) == np.inf
 
 
 @pytest.mark.long
