@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
 from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
 from calib.commissioning.arm_text import assumed_lines
-from calib.commissioning.bus_checks import bus_findings, turn_findings
+from calib.commissioning.bus_checks import bus_findings, silence_findings, turn_findings
 from calib.commissioning.model_checks import model_findings
 from calib.commissioning.model_judgement import arm_errors
 from calib.commissioning.motion_checks import motion_findings
@@ -58,6 +58,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     else:
         yield from _serial(arm_file)
         yield from turn_findings(arm_file)
+        yield from silence_findings(arm_file)
         if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)
