@@ -14,7 +14,7 @@ from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
 from armlink.link.bus_load import HIGH_LOAD, bus_loads
 from armlink.link.gate_limits import joint_ranges
-from armlink.link.joints.groups import make_groups
+from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
@@ -88,6 +88,24 @@ def turn_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             f"{arm_file.path}: link.joints",
             "armlink cannot detect this error: use an encoder that knows its turn, or check the reading of "
             "such a joint after each power-on, before it moves",
+        )
+
+
+def silence_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Joints that no command gives power, since nothing stops their drives when the host dies."""
+    try:
+        groups = make_groups(arm_file)
+    except ArmlinkError:  # as above
+        return
+    joints = zip(arm_file.require_link().joints, traits_of(groups), strict=True)
+    found = [joint.name for joint, traits in joints if traits.silence == "keeps on"]
+    if found:
+        yield SetupFinding(
+            "warning",
+            f"if the host dies, the drives of these joints keep on with their last command: {', '.join(found)}",
+            f"{arm_file.path}: link.joints",
+            "armlink reads them and gives them no power: state the time-out that is set in them, where they have one "
+            "(docs/drive-families.md)",
         )
 
 
@@ -200,6 +218,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     else:
         yield from _serial(arm_file, bus)
         yield from turn_findings(arm_file)
+        yield from silence_findings(arm_file)
         if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)

@@ -30,9 +30,9 @@ T = TypeVar("T")
 TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
 """Of a drive with the default keys; with a time-out it lets go."""
 POLLED = (RmdCommand.ERROR, RmdCommand.RUNTIME)
-CLOCK_TOLERANCE = 1000
-"""A time since the start that is further off than this since it was last told is that of a drive that has restarted
-[ms]: how late a reply may come to a host that stood still."""
+LONGEST_PAUSE = 3_600_000
+"""A time since the start that has passed by more, in 32 bits, has gone backwards: the drive has restarted. No host goes
+on after it stood still for so long [ms]."""
 LOADED = 0.02
 """A torque above this share of its limit shows whether the drive still makes it."""
 FOLLOWS = 0.5
@@ -56,8 +56,8 @@ class MyActuatorMemory(DriveMemory):
     asked: bool = False
     """The next state tells whether it still makes torque."""
     error: int = 0
-    started: tuple[float, int] | None = None
-    """When it told its time since the start [s], and that time [ms]."""
+    runtime: int | None = None
+    """Time since its start, as it last told it [ms]."""
     restarted: bool = False
     cycles: int = 0
 
@@ -220,7 +220,9 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         elif command == RmdCommand.ERROR:
             temperature, known.error = frames.unpack_error(data)
         elif command == RmdCommand.RUNTIME:
-            self._note_runtime(joint, frames.unpack_count(data), now)
+            before, known.runtime = known.runtime, frames.unpack_count(data)
+            if before is not None and (known.runtime - before) % 2**32 > LONGEST_PAUSE:
+                known.restarted, known.on = True, None  # what it would go on with is by another zero
         elif command not in (RmdCommand.OFF, RmdCommand.STOP):
             return None
         fault = "has restarted" if known.restarted else frames.error_text(known.error)
@@ -236,15 +238,6 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         shown = abs(known.torque) > LOADED * known.limits.max_torque
         follows = torque * math.copysign(1.0, known.torque) > FOLLOWS * abs(known.torque)
         known.on, known.stopped = (follows if shown else None), shown and not follows
-
-    def _note_runtime(self, joint: int, runtime: int, now: float) -> None:
-        known = self.memory[joint]
-        if known.started is not None:
-            then, before = known.started
-            passed = (runtime - before) % 2**32
-            if passed > 1000 * (now - then) + CLOCK_TOLERANCE:
-                known.restarted, known.on = True, None  # what it would go on with is by another zero
-        known.started = now, runtime
 
     @staticmethod
     def _power(known: MyActuatorMemory) -> Power:
@@ -276,7 +269,7 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         for known in self.memory:
             known.stopped = False
             if restarts:
-                known.restarted, known.started = False, None
+                known.restarted, known.runtime = False, None
 
     def poll(self, first: bool) -> list[Frame]:
         wanted = (RmdCommand.STATUS, RmdCommand.ANGLE)

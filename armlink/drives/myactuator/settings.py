@@ -1,5 +1,6 @@
 """Keys of a MyActuator joint in the arm file."""
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -7,6 +8,9 @@ from pydantic import Field, model_validator
 from armlink.arm_file import Positive
 from armlink.drives.myactuator.frames import LAST_ID, RATINGS, torque_constant
 from armlink.drives.settings import DriveSettings
+
+LEAST_GEAR = 6.0
+"""Of all models: a constant that is smaller by more than its root is nearer to the motor's than to the output's."""
 
 
 class MyActuatorSettings(DriveSettings):
@@ -27,6 +31,12 @@ class MyActuatorSettings(DriveSettings):
             raise ValueError(
                 f"model {self.model!r} is unknown: give one of {', '.join(RATINGS)}, or give torque_constant, the "
                 "rated torque over the rated current of the data sheet"
+            )
+        usual = torque_constant(self.model) if self.model in RATINGS else 0.0
+        if self.torque_constant is not None and self.torque_constant < usual / math.sqrt(LEAST_GEAR):
+            raise ValueError(
+                f"torque_constant {self.torque_constant:g} is that of the motor before the gear, by the ratings of an "
+                f"{self.model} ({usual:.3g} N·m/A at the output): currents would be too large"
             )
         return self
 

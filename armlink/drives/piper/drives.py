@@ -87,8 +87,8 @@ class PiperDrives(BasicDrives[PiperMemory]):
         return dict.fromkeys((*single, *several), "command to the Piper arm")
 
     def cycle_bits(self) -> float:
-        """Motion of each joint, positions of two, and a twentieth of the states."""
-        return (1.6 * self.m + 1) * longest_frame_bits(8)
+        """Motion of each joint, positions of two, a fifth of the states; of the arm state, tool pose and hand."""
+        return (1.7 * self.m + 5) * longest_frame_bits(8)
 
     def reading_ids(self) -> Mapping[int, int]:
         return {frames.POSITIONS_ID + (number - 1) // 2: joint for number, joint in self._joint_of.items()}

@@ -226,7 +226,5 @@ def test_the_hidden_factor_of_four_is_found_by_listening():
     for firmware, found in (("S-V1.6-3", [[]] * 3), ("S-V1.8-3", [[(("torque",), 4)]] * 3)):
         with Listener(with_firmware(firmware), Tap(said)) as listener:
             judged = by_listening(listener, lambda text: None, 6.0)[:3]
-        told = [
-            [each for one in joint.findings for each in (one.quantities, round(1 / one.factor))] for joint in judged
-        ]
+        told = [[(one.quantities, round(1 / one.factor)) for one in joint.findings] for joint in judged]
         assert told == found
