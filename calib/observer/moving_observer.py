@@ -38,7 +38,7 @@ by 1.4 times what was learned. Friction of a joint is never quite what it was; a
 UNSEEN_STD = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
 """Standard deviations of a joint's gain and offset [N·m] where rows of motion tell nothing; a choice."""
 NOTHING = np.zeros(2), np.diag(UNSEEN_STD**2)
-"""What is known of their change then, and its covariance."""
+"""Their change then, drawn to 0, and its covariance."""
 
 
 class ChangeTest:
