@@ -15,7 +15,7 @@ from calib.report.tables import ReportTable
 
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
-COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"]
+COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a"]
 MARGIN = {"l": 60, "r": 20, "b": 48}
 FIGURE_TEXTS = ("name", "text", "label", "ticktext", "x", "y")
 """Keys of plotly's figures whose texts have tags for plotly; none of ours has any."""
