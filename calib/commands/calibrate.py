@@ -52,11 +52,10 @@ def calibrate(
     from armlink.errors import BadInput, Refused
     from armlink.extras import require_extra
     from calib.api import calibrated
-    from calib.arm.kinematics import gcomp_arm
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep, drives_of
     from calib.fit.heldout import held_out_steps
-    from calib.fit.sensor_fit import SensorFit, felt_mass
+    from calib.fit.sensor_fit import SensorFit, mass_complaint
     from calib.install.apply import Apply, apply_creep, apply_record
     from calib.install.plausibility import replaced_record
     from calib.records.records import CalibrationRecord, GravityRecord, HeldOut
@@ -74,11 +73,10 @@ def calibrate(
     record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
     if isinstance(fit, SensorFit):
         record = record.model_copy(update={"drives": drives_of(data)})
-        felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
-        if felt is not None and felt.contradicts:
-            records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
+        if complaint := mass_complaint(fit.arm, fit.rows.readings):
+            records.add(record.model_copy(update={"note": f"not made current: {complaint}"}))
             write_json(json_file, _answer(fit, record, False))
-            raise Refused(f"{felt} Record {record.id} is stored, but not made current")
+            raise Refused(f"{complaint} Record {record.id} is stored, but not made current")
     out = results(json_file)
     _show(fit, out)
     user = getpass.getuser()

@@ -151,7 +151,7 @@ class ServiceView:
                 yield tuple(point for point in points if point is not None)
 
     def proposals(self, limit: int = 200) -> tuple[view.Proposal, ...]:
-        return tuple(row.answer() for row in self._service.journal.proposals(limit))
+        return tuple(row.proposal for row in self._service.journal.proposals(limit))
 
     def subscribe(self) -> Client:
         client = self._service.hub.subscribe()

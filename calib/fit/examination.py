@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.fit.calibration import OUTLIER, FitFinding
-from calib.fit.refinement import Extra, Refined, refine
+from calib.fit.refinement import Refined, refine
 from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Lags, PositionField, Setting, troubles
 from calib.fit.sweep_readings import FEWEST, SweepReadings
 from calib.fit.unmodelled_effects import (
@@ -51,8 +51,8 @@ def remaining_doubt(setting: Setting, rows: SweepReadings, refined: Refined) -> 
     near = poses + APART * away / np.linalg.norm(away, axis=1, keepdims=True)
     level, level_near, together = _moments(setting, rows, refined, poses, near)
     gain = np.abs(refined.fit.complete.gain)
-    lag = HELD * refined.levels.level[FAMILIES.index("direction")] * UNITS["direction"][0] * setting.rated
-    told = max(float(np.maximum(refined.levels.freedom, 0.0).sum()) / n, 1.0)
+    lag = HELD * refined.linear.levels.level[FAMILIES.index("direction")] * UNITS["direction"][0] * setting.rated
+    told = max(float(np.maximum(refined.linear.levels.freedom, 0.0).sum()) / n, 1.0)
     found = []
     for joint in range(n):
         size = float(np.sqrt(level[joint] + lag[joint] ** 2) / gain[joint])
@@ -77,8 +77,8 @@ def _moments(
         felt=np.full((2 * count, n), np.nan),
     )
     setting = replace(setting, lags=Lags.unknown(2 * count, n))
-    effects = troubles(setting, here, complete, refined.troubles.kept)
-    columns = effects.columns * refined.levels.level[effects.family]
+    effects = troubles(setting, here, complete, refined.linear.troubles.kept)
+    columns = effects.columns * refined.linear.levels.level[effects.family]
     free = np.isin(parameter_names(setting.arm), refined.fit.names)
     slopes = predict_and_jacobian(setting.arm, complete, readings)[1][:, free]
     covariance = np.nan_to_num(refined.fit.covariance)
@@ -147,13 +147,13 @@ def examine(
     outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
-        extras = tuple(extra for effect in effects for extra in effect.extras)
+        extras = [column for effect in effects for column in effect.columns]
         kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
         return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
     refined = fitted()
     for _ in range(MOST_EFFECTS):
-        strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
+        strange = _outliers(kinematics, refined, rows, [column for effect in effects for column in effect.columns])
         if (strange != outliers).any():
             outliers = strange
             refined = fitted()
@@ -184,8 +184,8 @@ def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Par
 def _sized(effects: list[UnmodelledEffect], refined: Refined) -> Iterator[tuple[UnmodelledEffect, Array]]:
     place = 0
     for effect in effects:
-        yield effect, refined.coefficients[place : place + len(effect.extras)]
-        place += len(effect.extras)
+        yield effect, refined.coefficients[place : place + len(effect.columns)]
+        place += len(effect.columns)
 
 
 def _doubted(sigma: Array, effects: list[UnmodelledEffect], refined: Refined) -> Array:
@@ -245,14 +245,14 @@ def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOutSweep, ...]
     return tuple(found)
 
 
-def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
+def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: list[Array]) -> Mask:
     """Outliers (K, n) by deleted residuals, in robust standard deviations of their joint.
 
     Readings left out before are judged again, since an effect added meanwhile may explain them.
     """
     linear, counted = refined.linear, rows.readings.counted
     error = rows.readings.torque - predict(kinematics, refined.fit.complete, rows.readings)
-    error -= sum((value * extra.column for value, extra in zip(refined.coefficients, extras, strict=True)), 0.0 * error)
+    error -= sum((value * column for value, column in zip(refined.coefficients, extras, strict=True)), 0.0 * error)
     deleted = error / (rows.readings.sigma * refined.factor)
     inside = np.zeros(counted.shape, dtype=bool)
     inside[linear.row, linear.joint] = True

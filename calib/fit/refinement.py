@@ -6,7 +6,7 @@ by restricted maximum likelihood (section 4.6). Effects that stand out against t
 same way, without a prior. Gauss-Newton from the global fit; each joint's noise is scaled to the scatter found.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,17 +134,6 @@ NEGLIGIBLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Extra:
-    """An extra column: change of the torque readings per unit of an effect."""
-
-    joint: int
-    """Index of the joint whose sensor shows the effect."""
-    kind: str
-    column: Array
-    """By reading (K, n)."""
-
-
-@dataclass(frozen=True, eq=False)
 class Linear:
     """The fit, linearised at its end: P counted readings; p parameters, rounding and extra columns."""
 
@@ -166,6 +155,13 @@ class Linear:
     """Columns of the fit's parameters, in standard deviations (P, p)."""
     effects: Array
     """Columns of the small troubles, each at its level, in standard deviations (P, m)."""
+    levels: Levels
+    """Of the small troubles."""
+    troubles: Troubles
+    solution: Array
+    """Change of the free parameters, then the extra columns' coefficients."""
+    triangle: Array
+    """Upper triangle of the whitened design, parameters and extra columns (p + m, p + m)."""
 
     @property
     def leverage(self) -> Array:
@@ -184,9 +180,6 @@ class Refined:
     linear: Linear
     coefficients: Array
     """Of the extras, in their units (m,)."""
-    levels: Levels
-    """Of the small troubles."""
-    troubles: Troubles
     certainty: Parameters
     """Degrees of freedom of each parameter's standard deviation, since noise and levels are estimates."""
 
@@ -196,28 +189,29 @@ def refine(
     setting: Setting,
     fit: GlobalFit,
     priors: Mapping[str, Prior],
-    extras: tuple[Extra, ...] = (),
+    extras: Sequence[Array] = (),
 ) -> Refined:
-    """Refine a global fit with the small troubles of `setting` as random effects."""
+    """Refine a global fit with the small troubles of `setting` as random effects.
+
+    `extras` are further columns, the change of the torque readings (K, n) per unit of an effect each.
+    """
     kinematics, readings = setting.arm, rows.readings
     problem = _Problem(rows, setting, fit, priors, extras)
-    vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
+    vector, factor, count = fit.complete.vector.copy(), np.ones(kinematics.n), int(problem.free.sum())
     level = np.ones(len(FAMILIES))
     for _ in range(NOISE_ROUNDS):
-        step = problem.step(vector, factor, level)
-        level = step.levels.level
-        vector[problem.free] += step.solution[: step.parameters]
-        raw, freedom = _scatter(step.linear, kinematics.n)
+        linear = problem.linearised(vector, factor, level)
+        level = linear.levels.level
+        vector[problem.free] += linear.solution[:count]
+        raw, freedom = _scatter(linear, kinematics.n)
         factor = np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), LEAST_FACTOR)
-    found = analyse(step.triangle, step.scale)
-    inner, behind = slice(0, step.parameters), slice(step.parameters, None)
+    found = analyse(linear.triangle, problem.scale)
     residual = np.full(readings.torque.shape, np.nan)
-    troubled = step.linear.effects @ (step.linear.effects.T @ step.linear.residual)
-    residual[readings.counted] = (step.linear.residual + troubled) * step.linear.sigma
-    determined, covariance = found.determined[inner], found.covariance[inner, inner]
+    troubled = linear.effects @ (linear.effects.T @ linear.residual)
+    residual[readings.counted] = (linear.residual + troubled) * linear.sigma
+    determined, covariance = found.determined[:count], found.covariance[:count, :count]
     deviation = np.zeros(len(vector))
     deviation[problem.free] = np.where(determined, np.sqrt(np.abs(np.diag(covariance))), np.inf)
-    scaled = step.linear.residual
     refined = replace(
         fit,
         values=Parameters.from_vector(np.where(np.isinf(deviation), np.nan, vector), kinematics.n),
@@ -225,51 +219,37 @@ def refine(
         complete=Parameters.from_vector(vector, kinematics.n),
         covariance=covariance,
         identifiable=determined,
-        null_space=describe_null_space(found.null_basis[inner], fit.names),
+        null_space=describe_null_space(found.null_basis[:count], fit.names),
         residual=residual,
-        chi2=float(scaled @ scaled),
+        chi2=float(linear.residual @ linear.residual),
         dof=round(float(freedom.sum())),
     )
     certainty = np.full(len(vector), 1.0)
-    certainty[problem.free] = _certainty(step, np.nan_to_num(covariance), freedom)
+    certainty[problem.free] = _certainty(linear, np.nan_to_num(covariance), freedom)
     return Refined(
         refined,
         factor,
-        step.linear,
-        step.solution[behind],
-        step.levels,
-        step.troubles,
+        linear,
+        linear.solution[count:],
         Parameters.from_vector(certainty, kinematics.n),
     )
 
 
-def _certainty(step: "_RefinementStep", covariance: Array, free: Array) -> Array:
+def _certainty(linear: Linear, covariance: Array, free: Array) -> Array:
     """Degrees of freedom (p,) of the parameters' variances, by Satterthwaite: 2 v² over the variance of v.
 
     v consists of each joint's noise, known from its `free` (n,) readings, and one part a family, in proportion to its
     level's square. Extra columns are left out of account.
     """
-    linear, families = step.linear, np.arange(len(FAMILIES))
+    families = np.arange(len(FAMILIES))
     weight = linear.precision @ (linear.design @ covariance)
-    parts = (step.troubles.family == families[:, None]).astype(float) @ (linear.effects.T @ weight) ** 2
+    parts = (linear.troubles.family == families[:, None]).astype(float) @ (linear.effects.T @ weight) ** 2
     noise = (linear.joint == np.arange(len(free))[:, None]).astype(float) @ weight**2
     variance = np.maximum(np.diag(covariance), 1e-300)
-    spread = 4 * np.einsum("fp,fg,gp->p", parts, step.levels.covariance, parts)
+    spread = 4 * np.einsum("fp,fg,gp->p", parts, linear.levels.covariance, parts)
     spread += (2 * noise**2 / np.maximum(free, 1.0)[:, None]).sum(axis=0)
     certainty: Array = 2 * variance**2 / np.maximum(spread, 1e-300)
     return np.maximum(certainty, 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _RefinementStep:
-    solution: Array
-    """Change of the free parameters, then the extras' coefficients."""
-    parameters: int
-    triangle: Array
-    scale: Array
-    linear: Linear
-    levels: Levels
-    troubles: Troubles
 
 
 class _Problem:
@@ -281,7 +261,7 @@ class _Problem:
         setting: Setting,
         fit: GlobalFit,
         priors: Mapping[str, Prior],
-        extras: tuple[Extra, ...],
+        extras: Sequence[Array],
     ) -> None:
         self.rows, self.setting = rows, setting
         kinematics, readings = setting.arm, rows.readings
@@ -290,14 +270,14 @@ class _Problem:
         self.mean, self.std = (values[self.free] for values in prior_vectors(kinematics.n, priors))
         self.row, self.joint = np.nonzero(readings.counted)
         count = len(self.row)
-        self.columns = np.column_stack([np.zeros((count, 0)), *(extra.column[readings.counted] for extra in extras)])
+        self.columns = np.column_stack([np.zeros((count, 0)), *(column[readings.counted] for column in extras)])
         torque = float(np.abs(readings.torque[readings.counted]).max())
         sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
         self.scale = np.concatenate([natural_units(kinematics, readings, fit.complete)[self.free], sizes])
         self.resolution = rows.resolution
 
-    def step(self, vector: Array, factor: Array, level: Array) -> _RefinementStep:
-        """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
+    def linearised(self, vector: Array, factor: Array, level: Array) -> Linear:
+        """The problem linearised, and solved, at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
         lag = WITHIN * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
@@ -330,7 +310,8 @@ class _Problem:
         part = inverse.T @ left[:count, keep]
         residual = inverse.T @ (whitened[:, -1] - whitened[:, :-1] @ solution)
         precision = inverse.T @ inverse
-        linear = Linear(
+        triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
+        return Linear(
             self.row,
             self.joint,
             sigma,
@@ -339,9 +320,11 @@ class _Problem:
             precision,
             design[:count, :free],
             random[:, rounding.shape[1] :],
+            levels,
+            found,
+            solution,
+            triangle,
         )
-        triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
-        return _RefinementStep(solution, free, triangle, self.scale, linear, levels, found)
 
 
 def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:

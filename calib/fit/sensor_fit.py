@@ -5,6 +5,7 @@ Before it: is the reference mass there that the data set says? Judged before any
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import stdtrit
@@ -34,29 +35,19 @@ MOST_SHARE_STD = 0.15
 """A joint counts if it tells the share to this standard deviation."""
 
 
-@dataclass(frozen=True)
-class FeltMass:
-    """The reference mass as the torque sensors feel it, if their gains are 1."""
-
-    stated: float
-    """[kg]."""
-    felt: float
-    """[kg]."""
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether this cannot be the stated mass, whatever the gains are."""
-        return not LEAST <= self.felt / self.stated <= MOST
-
-    def __str__(self) -> str:
-        return (
-            f"the loaded pass feels {self.felt:.1f} kg, but --reference-mass was {self.stated:g} kg: was the "
-            "mass attached, and is the number right?"
-        )
+def mass_complaint(arm: Arm, readings: StaticReadings) -> str | None:
+    """Why the reference mass cannot be the stated one, whatever the gains are; None where it may be."""
+    stated, felt = float(readings.load.max(initial=0.0)), felt_mass(arm, readings)
+    if felt is None or LEAST <= felt / stated <= MOST:
+        return None
+    return (
+        f"the loaded pass feels {felt:.1f} kg, but --reference-mass was {stated:g} kg: was the "
+        "mass attached, and is the number right?"
+    )
 
 
-def felt_mass(arm: Arm, readings: StaticReadings) -> FeltMass | None:
-    """The mass that is felt in readings with and without load; None if no joint tells it.
+def felt_mass(arm: Arm, readings: StaticReadings) -> float | None:
+    """The mass that is felt in readings with and without load, if gains are 1 [kg]; None if no joint tells it.
 
     Each joint is fitted alone: v = k (Y β + μ Y (E0 + Eρ ρ)) + o is linear in kβ, o, kμ and kμρ (docs/theory.md,
     section 4), and |kμ| over the stated mass is |k|, near 1, if the mass is there. Positions are taken as read.
@@ -78,7 +69,7 @@ def felt_mass(arm: Arm, readings: StaticReadings) -> FeltMass | None:
             spreads.append(found[1])
     if not shares:
         return None
-    return FeltMass(stated, stated * float(np.average(shares, weights=1 / np.square(spreads))))
+    return stated * float(np.average(shares, weights=1 / np.square(spreads)))
 
 
 def _first(columns: Array, values: Array, sigma: Array) -> tuple[float, float] | None:
@@ -110,24 +101,50 @@ COMMON = (
 class SensorFit(FittedCalibration):
     """Every sensor's gains and offsets from sweeps at rest."""
 
-    names: tuple[str, ...]
-    fit: GlobalFit
+    arm: Arm
     rows: SweepReadings
-    noise_factor: Array
-    """Scatter of the readings over their samples' noise (n,)."""
-    hysteresis: Array
-    """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
-    friction: Array
-    """Friction still locked at rest: half the mean difference of the drives' own torque between the directions, less
-    that of the sensors (n,) [N·m]; NaN if the drives report none."""
     goodness: Goodness
     """Whether the sensor model holds, with findings."""
-    quantiles: Parameters
-    """Student quantiles of 95 % intervals, one a parameter."""
-    reasons: dict[tuple[str, Parameter], str]
     gain_ratio: Array | None
     """Without a reference mass: gains as multiples of the last joint's (n,); NaN if unknown."""
     sources: dict[str, str]
+
+    @property
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.arm.names
+
+    @property
+    def fit(self) -> GlobalFit:
+        return self.goodness.refined.fit
+
+    @property
+    def noise_factor(self) -> Array:
+        """Scatter of the readings over their samples' noise (n,)."""
+        return self.goodness.refined.factor
+
+    @cached_property
+    def quantiles(self) -> Parameters:
+        """Student quantiles of 95 % intervals, one a parameter."""
+        return Parameters.from_vector(stdtrit(self.goodness.refined.certainty.vector, 0.975), self.arm.n)
+
+    @cached_property
+    def reasons(self) -> dict[tuple[str, Parameter], str]:  # type: ignore[override]
+        return missing_values(self.fit, self.rows)
+
+    @cached_property
+    def hysteresis(self) -> Array:
+        """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
+        left = self.rows.readings.torque - predict(self.arm, self.fit.complete, self.rows.readings)
+        return _half_difference(left, self.rows)
+
+    @cached_property
+    def friction(self) -> Array:
+        """Friction still locked at rest: half the mean difference of the drives' own torque between the directions,
+        less that of the sensors (n,) [N·m]; NaN if the drives report none."""
+        complete = self.fit.complete
+        gain = np.where(np.abs(complete.gain) > 1e-6, complete.gain, 1.0)
+        sensed = TorqueCalibration(gain, complete.offset).invert(self.rows.readings.torque)
+        return _half_difference(self.rows.motor_torque - sensed, self.rows)
 
     def estimate(self, parameter: str) -> tuple[Array, Array]:
         return getattr(self.fit.values, parameter), getattr(self.fit.std, parameter)
@@ -201,21 +218,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     with threadpool_limits(1, "blas"):  # matrices of a few hundred rows: on a busy machine threads are ten times slower
         good = _fit(arm_file, rows)
         gain_ratio = None if loaded else _gain_ratio(arm_file, rows)
-    fit = good.refined.fit
-    left = rows.readings.torque - predict(gcomp_arm(arm_file), fit.complete, rows.readings)
-    return SensorFit(
-        names=arm_file.joint_names,
-        fit=fit,
-        rows=rows,
-        noise_factor=good.refined.factor,
-        hysteresis=_half_difference(left, rows),
-        friction=_friction(fit, rows),
-        goodness=good,
-        quantiles=Parameters.from_vector(stdtrit(good.refined.certainty.vector, 0.975), len(arm_file.joint_names)),
-        reasons=missing_values(fit, rows),
-        gain_ratio=gain_ratio,
-        sources=digests(data),
-    )
+    return SensorFit(gcomp_arm(arm_file), rows, good, gain_ratio, digests(data))
 
 
 def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
@@ -231,13 +234,6 @@ def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
             priors["rho"] = section.known_point
     fit = identify_global(kinematics, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
     return examine(kinematics, rows, fit, priors, arm_file.require_link().rated_torques)
-
-
-def _friction(fit: GlobalFit, rows: SweepReadings) -> Array:
-    """Half difference (n,) between the directions of motor torque less sensor torque [N·m]."""
-    gain = np.where(np.abs(fit.complete.gain) > 1e-6, fit.complete.gain, 1.0)
-    sensed = TorqueCalibration(gain, fit.complete.offset).invert(rows.readings.torque)
-    return _half_difference(rows.motor_torque - sensed, rows)
 
 
 def _half_difference(values: Array, rows: SweepReadings) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from calib.fit.calibration import FitFinding
-from calib.fit.refinement import Extra, Refined
+from calib.fit.refinement import Refined
 from calib.fit.small_troubles import play
 from calib.fit.sweep_readings import FEWEST, SweepReadings
 from calib.motion.encoder_check import stuck_bits
@@ -39,7 +39,8 @@ class UnmodelledEffect:
     joint: int
     id: str
     """In `armlink.effect_catalogue`."""
-    extras: tuple[Extra, ...]
+    columns: tuple[Array, ...]
+    """Change of the torque readings per unit of each of its parameters (K, n)."""
     knee: float = np.nan
     """Torque at which a sensor begins to saturate [N·m]."""
     doubt: Array | None = None
@@ -65,7 +66,7 @@ def strongest_effect(
     total = float(linear.residual @ np.linalg.solve(linear.precision, linear.residual))  # rᵀr of the whitened residual
     freedom = float(np.trace(np.linalg.solve(linear.precision, linear.annihilator)))
     for effect in _candidates(kinematics, rows, refined):
-        columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
+        columns = np.column_stack([column[counted] for column in effect.columns]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
         told = columns.T @ linear.annihilator @ columns
@@ -73,7 +74,7 @@ def strongest_effect(
             continue  # the parameters can do nearly the same
         along = columns.T @ linear.residual
         coefficient = np.linalg.lstsq(told, along, rcond=1e-10)[0]
-        gain, m = float(along @ coefficient), len(effect.extras)
+        gain, m = float(along @ coefficient), len(effect.columns)
         free = freedom - m
         if free < 4:
             continue
@@ -105,7 +106,7 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         doubt = _lag_doubt(rows, joint)
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
-            columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
+            columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).columns[0] for side in sides)
             yield UnmodelledEffect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
         yield replace(
             _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
@@ -125,15 +126,14 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
         if float(np.ptp(angle[here])) > LEAST_ECCENTRIC_RANGE:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
-            extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
-            yield UnmodelledEffect(joint, "position.eccentricity", extras)
+            yield UnmodelledEffect(joint, "position.eccentricity", turn)
 
 
 def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> UnmodelledEffect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return UnmodelledEffect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
+    return UnmodelledEffect(joint, effect_id, (column,), knee)
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:

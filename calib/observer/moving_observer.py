@@ -10,7 +10,7 @@ here result in: changes found, changes not found, and none where there is none.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ by 1.4 times what was learned. Friction of a joint is never quite what it was; a
 
 UNSEEN_STD = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
 """Standard deviations of a joint's gain and offset [N·m] where rows of motion tell nothing; a choice."""
+NOTHING = np.zeros(2), np.diag(UNSEEN_STD**2)
+"""Their change then, drawn to 0, and its covariance."""
 
 
 class ChangeTest:
@@ -53,9 +55,10 @@ class ChangeTest:
         """The change that explains the rows; cause "none", "unknown" or "ambiguous" where no single one does."""
         fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
         nothing = np.empty(0)
-        none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.found.chi2, 0)})
+        misfit = self._misfit(self.found.chi2, 0)
         if not fits or self.found.chi2 - fits[0].bic < VERY_STRONG_EVIDENCE:
-            return none if self._misfit(self.found.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
+            cause = "none" if misfit <= MISFIT else "unknown"
+            return Verdict(cause, None, 1.0, nothing, np.empty((0, 0)), {"misfit": misfit})
         best, others = fits[0], fits[1:]
         scores = np.array([fit.bic for fit in fits] + [self.found.chi2])
         weight = np.exp(-(scores - best.bic) / 2)
@@ -67,14 +70,14 @@ class ChangeTest:
         cause, joint = best.hypothesis.cause, best.hypothesis.joint
         found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
         if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
-            return _with_cause(found, "unknown")
-        rivals = [fit.hypothesis for fit in others if fit.bic - best.bic < VERY_STRONG_EVIDENCE]
-        if rivals:
-            return _with_cause(found, "ambiguous", tuple(each.cause for each in rivals))
-        return found
+            return replace(found, cause="unknown", joint=None)
+        rivals = tuple(fit.hypothesis.cause for fit in others if fit.bic - best.bic < VERY_STRONG_EVIDENCE)
+        return replace(found, cause="ambiguous", rivals=rivals) if rivals else found
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
         """Whether these rows show that an earlier change of these values is there no more."""
+        if not values.size or cause == "unknown":
+            return True  # it had no size
         own = self._index(cause, joint)
         if own is None:
             return False
@@ -92,7 +95,7 @@ class ChangeTest:
         places = [self._index(cause, joint) for cause in ("gain", "offset")]
         columns = [self.found.columns[place] for place in places if place is not None]
         if not columns:
-            return np.zeros(2), np.diag(UNSEEN_STD**2)
+            return NOTHING
         fit = linear_posterior(np.hstack(columns), self.found.residual, np.zeros(2), UNSEEN_STD)
         return fit.x, fit.covariance
 
@@ -146,11 +149,6 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     return found
 
 
-def _with_cause(verdict: Verdict, cause: str, rivals: tuple[str, ...] = ()) -> Verdict:
-    joint = verdict.joint if cause == "ambiguous" else None
-    return Verdict(cause, joint, verdict.confidence, verdict.values, verdict.covariance, verdict.evidence, rivals)
-
-
 REFERENCE = 360
 """Rows without a change that the belief is learned from: four minutes of creeping."""
 LONGEST = 2 * LONGEST_WINDOW
@@ -161,21 +159,6 @@ AGREEING = 2
 UNEXPLAINED = 3
 """The same of tests that nothing explains: the first ones after a change have rows of before it."""
 SCHEMA = "moving/1"
-
-
-@dataclass(frozen=True, eq=False)
-class Reported:
-    """The newest verdict that was an event."""
-
-    cause: str
-    joint: int | None
-    values: Array
-    """Parameters of the change."""
-
-    @property
-    def is_change(self) -> bool:
-        """Whether it is a change that has a size."""
-        return bool(self.values.size) and self.cause != "unknown"
 
 
 class MovingObserver:
@@ -192,7 +175,8 @@ class MovingObserver:
         self._recent: list[Passage] = []
         self._count = np.zeros(arm.n, dtype=int)
         self._agreeing: tuple[str, int | None] = ("none", None)
-        self._reported = Reported("none", None, np.empty(0))
+        self._reported: tuple[str, int | None, Array] = ("none", None, np.empty(0))
+        """Cause, joint and parameters of the newest verdict that was an event."""
         self._blocks = 0
         self._tested: tuple[int, ChangeTest] | None = None
 
@@ -225,11 +209,7 @@ class MovingObserver:
         self._recent = (self._recent + block)[-LONGEST:]
         test = ChangeTest(self._belief, self._recent)
         verdict = test.verdict()
-        if (
-            verdict.cause == "none"
-            and self._reported.is_change
-            and not test.denies(self._reported.cause, self._reported.joint, self._reported.values)
-        ):
+        if verdict.cause == "none" and not test.denies(*self._reported):
             return []  # these rows do not show the change that was found
         said = verdict.cause, verdict.joint
         self._blocks = self._blocks + 1 if said == self._agreeing else 1
@@ -240,22 +220,17 @@ class MovingObserver:
         if verdict.cause == "ambiguous" or (learning and verdict.cause == "unknown"):
             return []  # more rows may decide
         enough = UNEXPLAINED if verdict.cause == "unknown" else AGREEING
-        if self._blocks < enough or said == (self._reported.cause, self._reported.joint):
+        if self._blocks < enough or said == self._reported[:2]:
             return []
-        self._reported = Reported(*said, verdict.values)
+        self._reported = (*said, verdict.values)
         joint = None if verdict.joint is None else self.arm.names[verdict.joint]
         return [Event(passage.t, "verdict", joint, verdict_evidence(verdict, self.arm.names) | {"motor": True})]
 
     def estimate(self) -> Estimate:
         test = self._test()
-        gain, offset = np.ones(self.arm.n), np.zeros(self.arm.n)
-        std = np.tile(UNSEEN_STD[:, None], self.arm.n)
-        for j in range(self.arm.n if test is not None else 0):
-            assert test is not None
-            change, covariance = test.sensor(j)
-            gain[j], offset[j] = 1 + change[0], change[1]
-            std[:, j] = np.sqrt(np.diag(covariance))
-        return Estimate(gain, std[0], offset, std[1], self._count.copy())
+        found = [NOTHING if test is None else test.sensor(j) for j in range(self.arm.n)]
+        change, std = (np.array(each).T for each in zip(*((c, np.sqrt(np.diag(v))) for c, v in found), strict=True))
+        return Estimate(1 + change[0], std[0], change[1], std[1], self._count.copy())
 
     def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, by motion like the latest; NaN where it tells none."""
@@ -277,8 +252,8 @@ class MovingObserver:
         """The rows that the belief rests on, and those since, as JSON values."""
         rows = {"learnt": self._belief.learnt, "block": self._block, "recent": self._recent}
         saved: dict[str, Any] = {name: [each.to_json() for each in some] for name, some in rows.items()}
-        reported = [self._reported.cause, self._reported.joint, self._reported.values.tolist()]
-        return {"schema": SCHEMA, "count": self._count.tolist(), "reported": reported, **saved}
+        cause, joint, values = self._reported
+        return {"schema": SCHEMA, "count": self._count.tolist(), "reported": [cause, joint, values.tolist()], **saved}
 
     def restore(self, values: dict[str, Any]) -> bool:
         n = self.arm.n
@@ -290,7 +265,7 @@ class MovingObserver:
             )
             count = np.array(values["count"], dtype=int)
             cause, joint, size = values["reported"]
-            reported = Reported(str(cause), joint, as_array("reported", np.array(size, dtype=float), (None,)))
+            reported = str(cause), joint, as_array("reported", np.array(size, dtype=float), (None,))
             if count.shape != (n,) or not (joint is None or 0 <= joint < n):
                 return False
         except UNREADABLE:

@@ -9,6 +9,7 @@ from plotly.subplots import make_subplots
 
 from calib.fit.creep_fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
+from calib.report.page import COLOURS
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
@@ -17,7 +18,6 @@ from gcomp.identify.sensor_model import predict
 
 Indices = npt.NDArray[np.intp]
 
-COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")
 GREY = "#9aa7b3"
 CURVE_POINTS = 60
 PANEL = 230

@@ -17,7 +17,7 @@ SCRIPT = Path(__file__).with_name("plotly-basic.min.js")
 """plotly.js with lines, points and bars alone: plotly.js-basic-dist-min of npm, in the version of plotly's own."""
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
-COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"]
+COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a"]
 FIGURE_TEXTS = ("name", "text", "label", "ticktext", "x", "y")
 """Keys of plotly's figures whose texts have tags for plotly; none of ours has any."""
 GRID = {"gridcolor": "#e8ecf0", "zerolinecolor": "#c6ced6", "automargin": True, "ticks": ""}

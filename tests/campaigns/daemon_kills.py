@@ -82,7 +82,7 @@ def life(folder: Path, seed: int, told: Connection) -> None:
         world[5, 0] = daemon.now()
         kept = daemon.service.journal.belief()
         rows = kept.state["rows"] if kept else 0
-        proposals = [[row.id, row.state] for row in daemon.service.journal.proposals(5)]
+        proposals = [[row.id, row.proposal.state] for row in daemon.service.journal.proposals(5)]
         told.send({"event": daemon.service.journal.last_event, "rows": rows, "proposals": proposals})
 
 

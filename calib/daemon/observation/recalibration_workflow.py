@@ -70,14 +70,15 @@ class RecalibrationWorkflow:
         self._worse = None
         current, last = recalibrator.record, None
         for row in self._journal.proposals():
-            if row.record == current.id and row.state in ("applied", "approved"):
+            proposal = row.proposal
+            if proposal.record == current.id and proposal.state in ("applied", "approved"):
                 last = row.finding
-            if row.state != "approved" or row.id in self._journal.deciding:
+            if proposal.state != "approved" or row.id in self._journal.deciding:
                 continue
-            if row.record == current.id:
-                self._written.append((row.joint, self._monotonic()))
+            if proposal.record == current.id:
+                self._written.append((proposal.joint, self._monotonic()))
                 with self._journal.transaction():
-                    self._applied(row, row.by or "daemon", current)
+                    self._applied(row, proposal.decided_by or "daemon", current)
             else:
                 note = "interrupted before it was in force"
                 self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
@@ -127,7 +128,7 @@ class RecalibrationWorkflow:
         row = self._journal.proposal(added)
         if row is None:  # the journal was begun anew meanwhile
             return
-        joint, evidence = row.joint, {"proposal": row.number}
+        joint, evidence = row.proposal.joint, {"proposal": row.proposal.id}
         limit = self._limit(joint)
         if limit:
             self._events.say(
@@ -167,13 +168,12 @@ class RecalibrationWorkflow:
 
     def _write(self, row: ProposalRow, by: str) -> Future[Proposal]:
         """Keep the approval on disk first, then write."""
-        recalibrator, number = self._active(), row.number
+        current, number, base = self._active().record.id, row.proposal.id, row.proposal.base
         self._require_pending(row)
         if self._jobs.busy or self._approved:
             raise NotPossible("another recalibration is under way: try again in a moment")
-        current = recalibrator.record.id
-        if row.base != current:
-            raise NotPossible(f"proposal {number} follows from record {row.base}, but record {current} is in force now")
+        if base != current:
+            raise NotPossible(f"proposal {number} follows from record {base}, but record {current} is in force now")
 
         def approved() -> None:
             self._approved.append((row, by))
@@ -186,33 +186,31 @@ class RecalibrationWorkflow:
     ) -> Future[Proposal]:
         """Keep a person's decision, then do what follows from it; the answer is there once it is on disk."""
         answer: Future[Proposal] = Future()
+        number, joint = row.proposal.id, row.proposal.joint
 
         def kept() -> None:
-            found = self._journal.proposal(row.id)
-            if found is None or found.record != row.record:
-                answer.set_exception(
-                    NoSuch(f"there is no proposal {row.number} any more: the journal was damaged and begun anew")
-                )
+            if not self._has(row):
+                gone = f"there is no proposal {number} any more: the journal was damaged and begun anew"
+                answer.set_exception(NoSuch(gone))
                 return
             then()
-            answer.set_result(self._named(row.number).answer())
+            answer.set_result(self._named(number).proposal)
 
         with self._journal.transaction():
             self._journal.decide(row.id, self._events.now(), state, by)
-            evidence = {"proposal": row.number, "by": by}
-            self._events.say(state, row.joint, f"{row.joint}: {state} by {by}", evidence)
+            self._events.say(state, joint, f"{joint}: {state} by {by}", {"proposal": number, "by": by})
             self._journal.once_kept(kept)
         return answer
 
     def _begin_write(self, row: ProposalRow, by: str) -> None:
-        recalibrator, joint = self._active(), self._names.index(row.joint)
+        recalibrator, joint = self._active(), self._names.index(row.proposal.joint)
         current = recalibrator.record.id
-        if row.base != current:
+        if row.proposal.base != current:
             self._keep_failure(row, Refused(f"record {current} came into force before it was written"))
             return
 
         def work() -> CalibrationRecord:
-            record = self._store.get(row.record)
+            record = self._store.get(row.proposal.record)
             assert isinstance(record, CalibrationRecord)
             recalibrator.apply(record, joint, by)
             return record
@@ -226,7 +224,7 @@ class RecalibrationWorkflow:
                 if again:
                     return
             else:
-                self._written.append((row.joint, self._monotonic()))
+                self._written.append((row.proposal.joint, self._monotonic()))
                 self._installed(outcome, row.finding)
                 self._forget(joint)
                 with self._journal.transaction():
@@ -244,33 +242,37 @@ class RecalibrationWorkflow:
         return self._decide(row, "rejected", by)
 
     def _require_pending(self, row: ProposalRow) -> None:
-        if row.state != "pending":
-            raise NotPossible(f"proposal {row.number} is already {row.state}")
+        if row.proposal.state != "pending":
+            raise NotPossible(f"proposal {row.proposal.id} is already {row.proposal.state}")
         if row.id in self._journal.deciding:
-            raise NotPossible(f"proposal {row.number} is already decided; the decision waits for the disk")
+            raise NotPossible(f"proposal {row.proposal.id} is already decided; the decision waits for the disk")
 
     # ---- after a write
 
     def _keep_failure(self, row: ProposalRow, error: ArmlinkError) -> None:
         with self._journal.transaction():
             self._decided(row, "failed", "daemon", str(error))
-            self._refused(row.finding, error, row.number)
+            self._refused(row.finding, error, row.proposal.id)
 
     def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
         """Keep a decision, unless the journal was begun anew since and has no such proposal."""
-        kept = self._journal.proposal(row.id)
-        if kept is not None and kept.record == row.record:
+        if self._has(row):
             self._journal.decide(row.id, self._events.now(), state, by, note)
+
+    def _has(self, row: ProposalRow) -> bool:
+        """Whether the journal still has this proposal; one that is begun anew gives its id to another."""
+        kept = self._journal.proposal(row.id)
+        return kept is not None and kept.proposal.record == row.proposal.record
 
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
-        self._checking = (row.joint,)
-        joint = record.joints[row.finding.joint]
-        gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
-        text = f"{row.joint}: record {record.id} is in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
-        evidence = {"proposal": row.number, "record": record.id, "replaces": row.base, "by": by, "applied": True}
+        joint, values, number = row.proposal.joint, record.joints[row.finding.joint], row.proposal.id
+        self._checking = (joint,)
+        gain = "as before" if values.gain is None else f"{values.gain:.5f}"
+        text = f"{joint}: record {record.id} is in force: gain {gain}, offset {values.offset or 0.0:.3f} N·m"
+        evidence = {"proposal": number, "record": record.id, "replaces": row.proposal.base, "by": by, "applied": True}
         self._decided(row, "applied", by)
-        self._events.say("recalibration", row.joint, text, evidence)
+        self._events.say("recalibration", joint, text, evidence)
 
     def restore(self) -> tuple[str, ...]:
         """Write the current record to controllers that hold another calibration; returns the joints written."""
@@ -380,7 +382,7 @@ class RecalibrationWorkflow:
         row = self._journal.proposal_numbered(number)
         if row is None:
             raise NoSuch(f"there is no proposal {number}: /api/proposals lists the present proposals")
-        if digest is not None and digest != row.digest:
+        if digest is not None and digest != row.proposal.hash:
             raise NotPossible(
                 f"proposal {number} does not have the hash {digest[:12]}…: look at the proposal again, then decide"
             )

@@ -438,7 +438,7 @@ class Journal:
         values = _iso(time), joint, record, base, json.dumps(finding.as_json())
         with self.transaction():
             for earlier in self.proposals():
-                if earlier.joint == joint and earlier.state == "pending":
+                if earlier.proposal.joint == joint and earlier.proposal.state == "pending":
                     self.decide(earlier.id, time, "superseded", "daemon", "replaced by a newer proposal")
             self._write(statement, number, *values, proposal=number)
         return number
@@ -455,13 +455,13 @@ class Journal:
         return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
-        return sum(row.state == "pending" for row in self.proposals())
+        return sum(row.proposal.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
         return self._rows.get(number)
 
     def proposal_numbered(self, number: int) -> ProposalRow | None:
-        return next((row for row in self._rows.values() if row.number == number), None)
+        return next((row for row in self._rows.values() if row.proposal.id == number), None)
 
     # ---- belief and history
 

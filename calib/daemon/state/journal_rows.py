@@ -20,59 +20,9 @@ from calib.records.records import number_of
 class ProposalRow:
     id: int
     """Its row in this journal; a journal that is begun anew counts from 1 again, so that nobody outside knows it."""
-    time: datetime
-    joint: str
-    record: str
-    """Id of the record that approval makes current."""
-    base: str
-    """Id of the record that it replaces."""
-    values: dict[str, Any]
-    """The finding, as JSON values."""
-    state: str
-    """pending, approved, applied, rejected, failed or superseded."""
-    by: str | None
-    decided: datetime | None
-    note: str
-
-    @property
-    def number(self) -> int:
-        """Its record's number, by which a person or a program names it: that is of what would be written and of nothing
-        else, in this journal and any other."""
-        return number_of(self.record)
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 (hex) of what a decision on it decides: joint, records and finding."""
-        content = json.dumps([self.joint, self.record, self.base, self.values], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()
-
-    @property
-    def finding(self) -> DriftFinding:
-        """The drift that it was made from."""
-        return DriftFinding.from_json(self.values)
-
-    def answer(self) -> Proposal:
-        finding = self.finding
-        gain_std, offset_std = finding.std
-        return Proposal(
-            id=self.number,
-            hash=self.digest,
-            time=self.time,
-            state=self.state,  # type: ignore[arg-type]
-            joint=self.joint,
-            cause=finding.cause,
-            gain=finding.gain,
-            gain_std=gain_std,
-            offset=finding.offset,
-            offset_std=offset_std,
-            rows=finding.rows,
-            confidence=finding.confidence,
-            record=self.record,
-            base=self.base,
-            decided_at=self.decided,
-            decided_by=self.by,
-            note=self.note,
-        )
+    finding: DriftFinding
+    """The drift that it was made from."""
+    proposal: Proposal
 
 
 PROPOSALS = (
@@ -84,21 +34,31 @@ PROPOSALS = (
 
 def proposal_of(row: tuple[Any, ...]) -> ProposalRow:
     """A row of PROPOSALS; raises ValueError, TypeError, KeyError or IndexError for one that holds something else."""
-    number, opened, joint, record, base, finding, state, by, decided, note = row
-    made = ProposalRow(
-        id=number,
+    number, opened, joint, record, base, found, state, by, decided, note = row
+    values = json.loads(found)
+    decides = json.dumps([joint, record, base, values], sort_keys=True)
+    finding = DriftFinding.from_json(values)
+    gain_std, offset_std = finding.std
+    proposal = Proposal(
+        id=number_of(record),
+        hash=hashlib.sha256(decides.encode()).hexdigest(),
         time=datetime.fromisoformat(opened),
+        state=state or "pending",
         joint=joint,
+        cause=finding.cause,
+        gain=finding.gain,
+        gain_std=gain_std,
+        offset=finding.offset,
+        offset_std=offset_std,
+        rows=finding.rows,
+        confidence=finding.confidence,
         record=record,
         base=base,
-        values=json.loads(finding),
-        state=state or "pending",
-        by=by,
-        decided=None if decided is None else datetime.fromisoformat(decided),
+        decided_at=None if decided is None else datetime.fromisoformat(decided),
+        decided_by=by,
         note=note or "",
     )
-    made.answer()
-    return made
+    return ProposalRow(number, finding, proposal)
 
 
 HistoryRow = tuple[datetime, float, str | None, dict[str, Any]]

@@ -5,6 +5,7 @@ request's head and for a client that does not read, and room for strangers on TC
 """
 
 import asyncio
+import logging
 import pwd
 import socket
 import struct
@@ -31,6 +32,8 @@ that is not whole by then is refused."""
 MOST_STRANGERS = 64
 """TCP connections that have not shown the token; a further one takes the place of the oldest."""
 _UCRED = struct.Struct("3i")
+
+log = logging.getLogger("armlink.daemon")
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,15 @@ class Connection(asyncio.Protocol):
         self._requests = 0
         """Requests under way."""
         self._deadlines: dict[str, asyncio.TimerHandle] = {}
+        self.deaf = False
+        """It was cut since it did not take what was sent to it."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(0)  # what the kernel does not take waits for the client
         self._state[PEER] = peer = describe_peer(self._transport, self)
         self._http.connection_made(self._transport)
-        self._cut_later("head")
+        self._cut_later("head", self.cut)
         if peer.tcp:
             if len(self.strangers) >= MOST_STRANGERS:
                 next(iter(self.strangers)).cut()
@@ -119,7 +124,7 @@ class Connection(asyncio.Protocol):
         self._http.eof_received()
 
     def pause_writing(self) -> None:
-        self._cut_later("take")
+        self._cut_later("take", self._cut_deaf)
         self._http.pause_writing()
 
     def resume_writing(self) -> None:
@@ -138,7 +143,7 @@ class Connection(asyncio.Protocol):
     def request_ends(self) -> None:
         self._requests -= 1
         if not self._requests and not self._transport.is_closing():
-            self._cut_later("head")
+            self._cut_later("head", self.cut)
 
     def trust(self) -> None:
         """It has shown the token."""
@@ -149,10 +154,15 @@ class Connection(asyncio.Protocol):
         self.strangers.pop(self, None)
         self._transport.abort()
 
-    def _cut_later(self, why: str) -> None:
+    def _cut_deaf(self) -> None:
+        log.warning("%s has read nothing for %.0f s and was cut off", self._state[PEER].name, PATIENCE_SECONDS)
+        self.deaf = True
+        self.cut()
+
+    def _cut_later(self, why: str, cut: Callable[[], None]) -> None:
         """Cut it once patience is over, unless that deadline is stopped before."""
         if why not in self._deadlines:
-            self._deadlines[why] = self._loop.call_later(PATIENCE_SECONDS, self.cut)
+            self._deadlines[why] = self._loop.call_later(PATIENCE_SECONDS, cut)
 
     def _stop(self, *names: str) -> None:
         for name in names:

@@ -1,7 +1,6 @@
 """The stream: server-sent events to many clients, each bounded; a client that does not read is cut off."""
 
 import asyncio
-import logging
 import sqlite3
 from collections import Counter
 from contextlib import suppress
@@ -9,17 +8,12 @@ from contextlib import suppress
 from fastapi.responses import StreamingResponse
 
 from calib.daemon.view import DaemonView, EventItem, EventRecord, JointsItem
-from calib.daemon.web.connection import Message, Receive, Scope, Send, peer_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, Receive, Scope, Send, peer_of
 from calib.daemon.web.history import Histories
 
-SEND_SECONDS = 5.0
-"""A client that accepts nothing for this time is cut off; after as long without an item a comment is sent, to find out
-whether it is still there [s]."""
 MOST_CLIENTS = 200
 RETRY = b"retry: 2000\n\n"
 """Browsers reconnect after two seconds."""
-
-_log = logging.getLogger(__name__)
 
 
 class Streams:
@@ -76,16 +70,11 @@ class Streams:
             for task in (client, gone):
                 task.cancel()
             results = await asyncio.gather(client, gone, return_exceptions=True)
-        if isinstance(results[0], TimeoutError):
-            self.cut_off += 1
-            _log.warning("stream: %s has read nothing for %.0f s and was cut off", peer_of(scope).name, SEND_SECONDS)
-            if (connection := peer_of(scope).connection) is not None:
-                connection.cut()
-            return
+        connection = peer_of(scope).connection
+        self.cut_off += connection is not None and connection.deaf
         if isinstance(results[0], Exception):
             raise results[0]
-        with suppress(TimeoutError):
-            await _send(send, b"", more=False)
+        await _send(send, b"", more=False)
 
     async def _send_all(self, send: Send, after: int | None) -> None:
         subscription = self._view.subscribe()
@@ -97,9 +86,9 @@ class Streams:
             while True:
                 item: JointsItem | EventItem | None = None
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(SEND_SECONDS):
+                    async with asyncio.timeout(PATIENCE_SECONDS / 2):
                         item = await subscription.get()
-                if item is None:
+                if item is None:  # is it still there?
                     await _send(send, b": nothing new\n\n")
                 elif isinstance(item, JointsItem):
                     await _send(send, self.encode(item))
@@ -138,10 +127,7 @@ class StreamResponse(StreamingResponse):
 
 
 async def _send(send: Send, data: bytes, more: bool = True) -> None:
-    """Raises TimeoutError if the client does not accept it."""
-    message: Message = {"type": "http.response.body", "body": data, "more_body": more}
-    async with asyncio.timeout(SEND_SECONDS):
-        await send(message)
+    await send({"type": "http.response.body", "body": data, "more_body": more})
 
 
 async def _until_gone(receive: Receive) -> None:

@@ -26,9 +26,9 @@ def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal:
 
     decided, other, first = propose("j1"), propose("j2"), propose("j1")
     journal.decide(other, NOW, "rejected", "ann")
-    assert journal.proposal(decided).state == "superseded"
+    assert journal.proposal(decided).proposal.state == "superseded"
     waiting, second = propose("j2"), propose("j1")
-    states = {row.id: row.state for row in journal.proposals()}
+    states = {row.id: row.proposal.state for row in journal.proposals()}
     assert states == {
         decided: "superseded",
         other: "rejected",
@@ -85,7 +85,7 @@ def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_p
     journal.decide(2, NOW, "approved", "ann")
     assert journal.add_proposal(NOW, "j1", "0a", "0b", finding) == 3
     journal.close()
-    assert [row.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]
+    assert [row.proposal.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]
 
 
 @pytest.mark.parametrize("how", ["moved", "another", "older copy", "no journal"])

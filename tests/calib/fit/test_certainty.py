@@ -17,15 +17,17 @@ def test_a_parameter_that_one_joint_s_readings_tell_has_their_degrees_of_freedom
     design[joint == 1, 1] = random.normal(size=30)
     design[:, 2] = random.normal(size=42)
     covariance = np.linalg.inv(design.T @ design)
-    linear = SimpleNamespace(joint=joint, precision=np.eye(42), design=design, effects=np.zeros((42, 0)))
     nothing = np.zeros((len(FAMILIES), len(FAMILIES)))
-    step = SimpleNamespace(
-        linear=linear,
+    linear = SimpleNamespace(
+        joint=joint,
+        precision=np.eye(42),
+        design=design,
+        effects=np.zeros((42, 0)),
         levels=SimpleNamespace(covariance=nothing),
         troubles=SimpleNamespace(family=np.zeros(0, int)),
     )
     free = np.array([9.0, 25.0])
-    alone = SimpleNamespace(**vars(step) | {"linear": SimpleNamespace(**vars(linear) | {"design": design[:, :2]})})
+    alone = SimpleNamespace(**vars(linear) | {"design": design[:, :2]})
     np.testing.assert_allclose(_certainty(alone, np.linalg.inv(design[:, :2].T @ design[:, :2]), free), free)
-    mixed = _certainty(step, covariance, free)[2]
+    mixed = _certainty(linear, covariance, free)[2]
     assert free.max() < mixed < free.sum()  # two independent variances, each known by its own readings

@@ -21,7 +21,8 @@ def test_the_length_is_that_over_which_the_disagreement_of_two_poses_fades(sarco
     )
     gain = np.full(n, -2.0)
     levels = SimpleNamespace(level=np.zeros(len(FAMILIES)), freedom=np.full(n, 4.0))
-    refined = SimpleNamespace(fit=SimpleNamespace(complete=SimpleNamespace(gain=gain)), levels=levels)
+    linear = SimpleNamespace(levels=levels)
+    refined = SimpleNamespace(fit=SimpleNamespace(complete=SimpleNamespace(gain=gain)), linear=linear)
     found = module.remaining_doubt(SimpleNamespace(arm=sarcos, rated=np.ones(n)), None, refined)
     assert [each.length for each in found] == pytest.approx([*length[:-1], 4.99], rel=0.01)  # none longer is told
     assert [each.level for each in found] == pytest.approx(np.sqrt(level) / 2)

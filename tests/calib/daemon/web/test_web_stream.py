@@ -17,6 +17,7 @@ from served_page import Served, served
 from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView
+from calib.daemon.web import connection
 from calib.daemon.web import stream as stream_module
 from calib.daemon.web.stream import Streams
 
@@ -175,7 +176,7 @@ def until(server: Served, wanted: Any) -> None:
 
 
 def test_a_client_that_does_not_read_is_cut_off(server: Served, view: MadeUpView, monkeypatch) -> None:
-    monkeypatch.setattr(stream_module, "SEND_SECONDS", 1.0)
+    monkeypatch.setattr(connection, "PATIENCE_SECONDS", 1.0)
 
     def flood() -> bool:
         view.tick()
