@@ -117,7 +117,9 @@ def test_an_observer_with_the_tool_takes_it_for_no_payload():
     found = []
     for arm_file in (SARCOS, carries):
         observer = observer_of(fast.arm, calibration(), at.carrying(arm_file), fast.rated, ObserverConfig())
-        found.append([event.evidence["cause"] for event in fast.run(observer, 400.0, apply=False) if event.kind == "verdict"])
+        found.append(
+            [event.evidence["cause"] for event in fast.run(observer, 400.0, apply=False) if event.kind == "verdict"]
+        )
     assert set(found[0]) == {"payload"}
     assert found[1] == []
 
