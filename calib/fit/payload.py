@@ -12,6 +12,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from calib.fit.field_fit import UNKNOWN_MOMENT, FieldProblem, scatter_factor
+from calib.fit.pose_fit import rms
 from calib.fit.scatter import NOISE_ROUNDS
 from calib.fit.slow_windows import directions
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -78,10 +79,11 @@ def weigh_payload(
         solved = problem.solve(columns, noise, more=[UNKNOWN_MOMENT] * 4)
         left = problem.table(readings.torque[readings.counted] - columns @ solved.x)
         noise = readings.sigma * np.maximum(scatter_factor(left, readings), 1.0)
-    rms = np.sqrt(np.nanmean(left**2, axis=0)) / np.abs(problem.installed.gain)
     value = solved.x[-4:]
     of_scale = common_scale_std(calibration) * value
-    return Payload(value, solved.covariance[-4:, -4:] + np.outer(of_scale, of_scale), rms)
+    return Payload(
+        value, solved.covariance[-4:, -4:] + np.outer(of_scale, of_scale), rms(left) / np.abs(problem.installed.gain)
+    )
 
 
 def common_scale_std(calibration: CalibrationRecord) -> float:

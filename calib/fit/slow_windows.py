@@ -43,11 +43,11 @@ class WindowAverages:
     direction: Array
     """Sign of each joint's last motion."""
     slow: Mask
-    """WindowAverages in which all joints move slowly and steadily (W,)."""
+    """Windows in which all joints move slowly and steadily (W,)."""
 
 
 def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowAverages:
-    """Raises BadInput where there is no window."""
+    """Averages over windows of times (K,) [s] with positions and torques (K, n); raises BadInput if there is none."""
     windows = _windows(t)
     if not windows:
         raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
@@ -69,7 +69,7 @@ def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowA
 
 
 def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:
-    """WindowAverages of a recording in which all joints move slowly and steadily.
+    """Windows of a recording in which all joints move slowly and steadily.
 
     `held` (n,) is what the controllers held: what they sent is turned back into the sensors' own readings. Raises
     BadInput if there is no joint torque, or nothing slow enough.
@@ -111,7 +111,7 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
 
 
 def _windows(t: Array) -> list[slice]:
-    """WindowAverages of WINDOW seconds with enough samples and without gaps."""
+    """Windows of WINDOW seconds with enough samples and without gaps."""
     windows, begin = [], 0
     while begin < len(t):
         end = int(np.searchsorted(t, t[begin] + WINDOW))

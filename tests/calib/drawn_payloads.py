@@ -7,6 +7,7 @@ from drawn_arms import drawn_arm
 from realistic_sweeps import RestingArm, both_passes, plans
 
 from armlink.arm_file import ArmFile
+from armlink.errors import Refused
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.fit.gravity_fit import identify_gravity
@@ -14,6 +15,7 @@ from calib.fit.payload import Payload, raw_readings, weigh_payload
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.poses import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
+from calib.sweep.weigh import FEWEST
 from sim_bus.sim_section import with_realism
 
 Array = np.ndarray
@@ -50,8 +52,7 @@ class Calibrated:
         limits, free = DriveLimits.of(self.arm), np.full(len(self.arm.joint_names), np.nan)
         middle = (limits.lower + limits.upper) / 2
         simulated = self.resting.simulated
-        object.__setattr__(simulated.truth, "attachment", np.asarray(centre, float))
-        simulated.attach_mass(mass)
+        simulated.attach_mass(mass, centre)
         try:
             at = weighing_poses(self.arm, poses, seed, middle)
             torque = simulated.gravity_torque(at)
@@ -60,6 +61,8 @@ class Calibrated:
             got = [self.resting.read(pose, free)[:2] for pose in at[held.all(axis=1)]]
         finally:
             simulated.detach_mass()
+        if len(got) < FEWEST:
+            raise Refused(f"{len(got)} of {poses} poses were reached")
         shown, torque = (np.array(each) for each in zip(*got, strict=True))
         record = self.calibration
         sigma = sweep_section(self.arm).standard_error * limits.rated

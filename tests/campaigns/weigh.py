@@ -36,7 +36,7 @@ def main() -> int:
         mass, centre = draw_payload(random)
         try:
             weighed = calibrated_arm(seed, level).weigh(mass, centre, POSES, seed)
-        except Refused as refused:  # an arm whose sweeps cannot tell the scale of torque
+        except Refused as refused:  # an arm whose sweeps cannot tell the scale of torque, or that cannot hold this load
             print(f"{seed:>4}: left out: {refused}"[:110], flush=True)
             seed += 1
             continue
