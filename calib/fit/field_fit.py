@@ -202,7 +202,7 @@ def fit_field(
         columns = problem.columns(gain)
         solved = problem.solve(columns, noise, np.ones(n))
         residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
-        gain, noise = solved.x[:n], rows.sigma * np.maximum(_scatter(residual, rows), 1.0)
+        gain, noise = solved.x[:n], rows.sigma * np.maximum(scatter_factor(residual, rows), 1.0)
     unseen = np.sqrt(np.diag(solved.covariance)[:n]) > LOOSEST_GAIN * np.abs(gain)
     if unseen.any():
         columns = problem.columns(np.where(unseen, problem.installed.gain, gain))
@@ -212,7 +212,7 @@ def fit_field(
     return _report(problem, columns, solved, unseen, sources or {})
 
 
-def _scatter(residual: Array, rows: StaticReadings) -> Array:
+def scatter_factor(residual: Array, rows: StaticReadings) -> Array:
     """Factor (n,) on the standard deviation of a row: of the residuals, and for neighbours that are alike."""
     factor = np.ones(residual.shape[1])
     for joint, counted in enumerate(rows.counted.T):

@@ -5,7 +5,7 @@ position zeros taken as read. Its priors are those of a sound arm; the scatter i
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -33,7 +33,6 @@ ACCURACY = 0.01
 """Distance from the most probable values at which the search ends, in standard deviations of the posterior."""
 CANDIDATES = 300
 """Poses, drawn within the limits, of which the further ones are chosen."""
-RESOLUTION = float(np.finfo(float).tiny)
 DRAWS = 1000
 """Of the posterior, for the bound on the RMS of gravity: its 95 % quantile is then known to 3 %."""
 
@@ -168,11 +167,9 @@ class PoseFit:
         known = self.model.known.copy()
         known[own] = self.nominal
         model, std = PartialModel(self.model.whole, known, free), self.prior_std[free]
-        solution = most_probable(model, self._whiten, self.prior_mean[free], std, self.x[free], ACCURACY)
+        whiten = partial(_whitened, self.white)
+        solution = most_probable(model, whiten, self.prior_mean[free], std, self.x[free], ACCURACY)
         return replace(self, model=model, solution=solution)
-
-    def _whiten(self, columns: Array) -> Array:
-        return np.asarray((columns.T * self.white).T)
 
     def best_poses(self, count: int) -> tuple[Array, Array]:
         """Further poses (C, n) [rad] within the limits that together tell most (D-optimal), and the bound (n,) [N·m]
@@ -183,7 +180,8 @@ class PoseFit:
         sides = np.tile([[1.0], [-1.0]], (CANDIDATES, n)) * self.readings.direction.any()
         q = np.repeat(poses, 2, axis=0)
         readings = StaticReadings(q, np.zeros_like(q), np.ones(n), direction=sides)
-        noise = 1 / np.sqrt(np.maximum(_mean(self.white**2, self.readings.counted), RESOLUTION))
+        weight = _mean(self.white**2, self.readings.counted)
+        noise = 1 / np.sqrt(np.where(weight > 0, weight, weight.max()))
         _, columns = PartialModel(MotorModel(arm, readings), self.x, self.model.free).linearised(self.solution.x)
         columns = (columns.T / np.tile(noise, len(q))).T.reshape(CANDIDATES, -1, len(self.solution.x))
         unit = np.sqrt(np.diag(self.solution.covariance))
@@ -224,18 +222,22 @@ def fit_poses(
         lever = np.linalg.norm(gravity_regressor(arm, readings.position), axis=-1).mean(axis=0)
         most = int(np.argmax(rms(readings.torque) * (lever > VERTICAL * np.linalg.norm(arm.gravity))))
         scale, free = arm.names[most] * (gain_std > 0), free[free != slices["gain"].start + most]
-    partial, x = PartialModel(model, known, free), mean[free]
+    own, x = PartialModel(model, known, free), mean[free]
     white = 1 / np.hypot(0.01 * rated[model.joint], readings.sigma[readings.counted])
     for last in range(NOISE_ROUNDS, 0, -1):
-        root = white
-        solution = most_probable(partial, lambda c, root=root: (c.T * root).T, mean[free], std[free], x, ACCURACY)  # type: ignore[misc]
+        solution = most_probable(own, partial(_whitened, white), mean[free], std[free], x, ACCURACY)
         x = solution.x
-        coulomb = np.maximum(np.abs(partial.complete(x)[slices["coulomb"]]), LEAST_COULOMB * rated)
+        coulomb = np.maximum(np.abs(own.complete(x)[slices["coulomb"]]), LEAST_COULOMB * rated)
         determined = float(np.sum(1 - np.diag(solution.covariance) / std[free] ** 2))
         if last > 1:
             std = doubt.prior(arm, rated, True, coulomb)[1]
             white = _root_weights(readings, solution.residual, white, determined, LEAST_STD_SHARE * rated)
-    return PoseFit(arm, readings, nominal, partial, solution, mean, std, white, scale, sources or {})
+    return PoseFit(arm, readings, nominal, own, solution, mean, std, white, scale, sources or {})
+
+
+def _whitened(white: Array, columns: Array) -> Array:
+    """Columns (R, …) times the root weights (R,)."""
+    return np.asarray((columns.T * white).T)
 
 
 def _root_weights(readings: StaticReadings, residual: Array, white: Array, determined: float, floor: Array) -> Array:
@@ -244,12 +246,13 @@ def _root_weights(readings: StaticReadings, residual: Array, white: Array, deter
     Student's t as the core has it; a joint's weights are such that they stand for as many normal readings as its
     residuals are worth (Huber's variance of an M-estimate), what neighbours have in common taken into account.
     """
-    counted, own = readings.counted, readings.sigma
-    spread, left = np.ones(counted.shape), np.zeros(counted.shape)
-    left[counted] = residual
-    total = np.sqrt(1 / np.maximum(_mean(white**-2.0, counted), 1e-300))
-    spread = np.sqrt(1 + (own * total) ** 2)
-    left = (left / spread).T
+    counted = readings.counted
+    whole = np.zeros(counted.shape)
+    whole[counted] = residual
+    variance = _mean(white**-2.0, counted)
+    spread = np.sqrt(1 + readings.sigma**2 / np.where(variance > 0, variance, 1.0))
+    """Of a reading that is doubted beforehand, over that of the others of its joint."""
+    left = (whole / spread).T
     problem = EstimationProblem((), lambda theta: theta, counted.T.astype(float), readings.series, floor)
     variance = scale_of(problem, left)
     weight = robust_weight(left, variance, FREEDOM)

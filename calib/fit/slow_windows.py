@@ -47,7 +47,7 @@ class WindowAverages:
 
 
 def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowAverages:
-    """Raises BadInput where there is no window."""
+    """Averages over windows of times (K,) [s] with positions and torques (K, n); raises BadInput if there is none."""
     windows = _windows(t)
     if not windows:
         raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")

@@ -18,6 +18,7 @@ from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
 from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
@@ -60,6 +61,26 @@ def scout_poses(
     information = np.einsum("kip,kiq->kpq", rows, rows)
     (chosen,) = select([information[None]], UNKNOWN * np.eye(3 * n)[None], [n + 3], exchanges=0)
     return tuple(tuple(pose.tolist()) for pose in nearest_first(poses[chosen], ends.mean(axis=1)))
+
+
+def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
+    """Poses (P, n) [rad] that tell a payload's mass and place best (D-optimal), in an order with little travel.
+
+    Where the arm file has geometry, poses in which bodies touch are left out.
+    """
+    kinematics, limits, section = gcomp_arm(arm_file), DriveLimits.of(arm_file), sweep_section(arm_file)
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(kinematics.n)])
+    poses = ends[:, 0] + np.random.default_rng([seed, 8]).random((300, kinematics.n)) * (ends[:, 1] - ends[:, 0])
+    if arm_file.model_path is not None:
+        poses = poses[Geometry(arm_file).free(poses)]
+        if len(poses) < count:
+            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+    columns = gravity_regressor(kinematics, poses) @ np.column_stack(payload_columns(kinematics))
+    rows = np.concatenate([columns, np.broadcast_to(np.eye(kinematics.n), (*columns.shape[:2], kinematics.n))], axis=2)
+    rows = rows / limits.rated[:, None]
+    information = np.einsum("kip,kiq->kpq", rows, rows)
+    (chosen,) = select([information[None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
+    return nearest_first(poses[chosen], begin)
 
 
 def nearest_first(poses: Array, begin: Array) -> Array:

@@ -17,8 +17,8 @@ import numpy as np
 
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile
-from armlink.content.atomic_file import writing
 from armlink.commands.plain_console import command_line, suggest
+from armlink.content.atomic_file import writing
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample

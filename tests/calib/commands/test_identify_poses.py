@@ -1,5 +1,6 @@
 """`armlink identify` of poses: gravity within its bounds, files that others read, and one clear error per bad input."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from drawn_poses import draw, outcome
 from real_poses import real_poses
 
 from armlink import cli
+from armlink.recording.files import keeps_names, save_recording
+from armlink.recording.recording import Recording, take_joints
 from calib.arm.stated_model import stated_model
 from calib.commands.identify_poses import judged_fit
+from gcomp.arm.load import inertial_torque
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
@@ -91,6 +95,26 @@ def test_a_known_mass_tells_gain_and_offset(bench):
     assert answer["gain"]["estimated"] == pytest.approx([1.1, 1.1], abs=0.02)
     assert answer["offset"]["estimated"] == pytest.approx([0.5, 0.5], abs=0.1)
     assert answer["reference_point"][0] == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("suffix", ["csv.gz", "mcap", "parquet"])
+def test_a_recording_of_an_arm_that_goes_from_pose_to_pose(bench, tmp_path, suffix):
+    true = stated_model(str(bench / "true.xml")).placed.arm
+    poses = np.random.default_rng(8).uniform(-1.5, 1.5, (30, 2))
+    share = np.clip(np.linspace(0, 2, 60, endpoint=False), 0, 1)[:, None]  # a second of travel, a second of rest
+    steps = np.concatenate([a + (b - a) * (3 * share**2 - 2 * share**3) for a, b in itertools.pairwise(poses)])
+    speed = np.gradient(steps, 1 / 30, axis=0)
+    heavier = stated_model(str(bench / "true.xml")).placed
+    torque = gravity_torque(true.arm, true.beta, steps)
+    torque += inertial_torque(heavier, steps, speed, np.gradient(speed, 1 / 30, axis=0))
+    torque += np.random.default_rng(9).normal(0.0, 0.02, steps.shape)
+    swapped = Recording(np.arange(len(steps)) / 30.0, steps[:, ::-1], torque=torque[:, ::-1], names=("b", "a"))
+    path = tmp_path / f"run.{suffix}"
+    save_recording(swapped if keeps_names(path) else take_joints(swapped, [1, 0]), path)
+    answer = answered(bench, str(path), "--model", "arm.xml", "--gain-std", "0")
+    assert answer["poses"] > 100
+    assert np.abs(np.array(answer["beta"]) - true.beta).max() < 0.03
+    assert answer["held_out"]["passed"] is True
 
 
 def test_without_a_mass_the_scale_is_said_to_be_open(bench):

@@ -234,3 +234,40 @@ def test_a_directory_that_is_no_data_set(tmp_path: Path, capsys: pytest.CaptureF
 def test_help_has_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run([name, "--help"]) == 0
     assert "Example: armlink" in capsys.readouterr().out
+
+
+def test_what_the_arm_carries_is_weighed_and_then_declared(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = ["--store", str(tmp_path / "records.db")]
+    for command in ("calibrate", "identify"):
+        assert run([command, str(swept), str(loaded), "--arm", str(arm_path), *store]) == 0
+    heavier = ["--bus", f"armlink_sim:{loaded.parent / 'heavier.yaml'}"]
+    plan = load_data(swept).plan
+    assert plan is not None
+    answer = tmp_path / "weigh.json"
+    assert run(["weigh", str(arm_path), *heavier, *store, "--yes", "--poses", "6", "--json", str(answer)]) == 0
+    found = json.loads(answer.read_text(encoding="utf-8"))
+    assert found["schema"] == "armlink.weigh/1"
+    assert found["mass_ci95"][0] < plan.reference_mass < found["mass_ci95"][1]
+    for (low, high), true in zip(found["centre_ci95"], (0.1, 0.12, 0.05), strict=True):
+        assert low is None or low - 1e-3 < true < high + 1e-3
+    tool = f"{plan.reference_mass},0.1,0.12,0.05"
+    capsys.readouterr()
+    assert run(["verify", str(arm_path), *heavier, *store, "--yes", "--poses", "4"]) == 1
+    assert run(["verify", str(arm_path), *heavier, *store, "--yes", "--poses", "4", "--tool", tool]) == 0
+
+
+def test_weigh_without_records_says_how_to_make_them(
+    arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["weigh", str(arm_path), "--store", str(tmp_path / "none.db"), "--yes"]) == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    assert "no gravity record yet" in error
+
+
+@pytest.mark.parametrize("options", [["--poses", "3"], ["--seed", "-1"], ["--poses", "many"]])
+def test_weigh_refuses_options_out_of_range(arm_path: Path, capsys: pytest.CaptureFixture[str], options: list) -> None:
+    assert run(["weigh", str(arm_path), *options]) == 2
+    assert options[0] in capsys.readouterr().err

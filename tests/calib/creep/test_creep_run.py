@@ -16,6 +16,7 @@ from calib.fit.creep_fit import fit_creep
 from calib.plan.creep_plan import CreepGround, check_creep_limits, plan_creep
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
+from calib.sweep.weigh import run_weigh
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -45,11 +46,16 @@ def test_passes_through_the_link_find_constants_that_verification_confirms(tmp_p
         fit = fit_creep(arm(), passes)
         record = fit.record(arm())
         check = run_verify(link, arm(), fit.gravity.record(arm(), record), record, poses=3)
+        simulated.attach_mass(plan.reference_mass / 2, simulated.truth.attachment)
+        payload, reached = run_weigh(link, arm(), fit.gravity.record(arm(), record), record, poses=6)
         link.disable()
     assert all(data.creeps and not data.contacts for data in passes)
     np.testing.assert_allclose(fit.value("gain") / simulated.true_sensors.gain, 1.0, atol=0.015)
     assert not fit.findings
     assert check.passed
+    assert reached == 6
+    assert abs(payload.mass - plan.reference_mass / 2) < 3 * payload.mass_std
+    assert payload.mass_std < 0.1 * payload.mass
     line = json.loads((tmp_path / "empty" / "readings.jsonl").read_text().splitlines()[1])
     assert line["speed"] == pytest.approx(0.3, abs=0.02)
     assert len(line["temperature"]) == 2
