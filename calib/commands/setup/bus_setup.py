@@ -43,7 +43,7 @@ def rewire(
     A copy of a `bundled` arm takes the serial number of its first drive.
     """
     from armlink.arm_file import Bus, load_arm, parse_arm
-    from armlink.content.file_content import MOST_YAML, read_whole
+    from armlink.content.file_content import read_whole
     from armlink.content.yaml_text import yaml_comment
     from calib.commissioning.wiring import match_by_ids, match_drives, wired_text
 
@@ -60,7 +60,7 @@ def rewire(
     finally:
         opened.shutdown()
     serial = (matches[0].drive.serial or "unknown") if bundled else ""
-    text, doubts = wired_text(read_whole(model, MOST_YAML).decode(), arm, matches, out, keys, serial)
+    text, doubts = wired_text(read_whole(model).decode(), arm, matches, out, keys, serial)
     if out.resolve() != model.resolve():
         title = f"{arm.name} with the drives on {channel}: made from {model.name} by `armlink new`."
         text = f"{yaml_comment(title)}\n{text}"
