@@ -145,9 +145,8 @@ def _with_right_columns(
     for channel in CHANNELS:
         while channel in s.channels and len(found) < 2 * arm.n:
             motion = motion_of(s, channel)
-            if bool(
-                (motion.reading.std(0) < SIGNIFICANT * s.noise[channel]).all()
-            ):  # of an arm that swings, its drives off
+            silent = motion.reading.std(0) < SIGNIFICANT * s.noise[channel]
+            if silent.all():  # an arm that swings, its drives off
                 break
             finding = find_wrong_columns(arm, motion, stated, follows_position(recording), known)
             if finding is None or finding.option in {each.option for each in found}:

@@ -62,10 +62,10 @@ class ColumnPairs:
 def column_pairs(values: Array, motion: Array, scale: tuple[float, float]) -> ColumnPairs:
     """Columns (K, n) of a channel and of its joints' motion."""
     there = np.isfinite(values).all(axis=1) & np.isfinite(motion).all(axis=1)
-    x, y = (each[there] - each[there].mean(0) for each in (values, motion))
-    products, own = x.T @ y, np.maximum((y**2).sum(0), 1e-18)
-    match = products / np.sqrt(np.maximum((x**2).sum(0), 1e-18)[:, None] * own)
-    spread = np.sqrt(np.maximum((x**2).mean(0), (y**2).mean(0)))
+    count = max(int(there.sum()), 1)
+    x, y = (each[there] - each[there].sum(0) / count for each in (values, motion))
+    products, size, own = x.T @ y, np.maximum((x**2).sum(0), 1e-18), np.maximum((y**2).sum(0), 1e-18)
+    match, spread = products / np.sqrt(size[:, None] * own), np.sqrt(np.maximum(size, own) / count)
     return ColumnPairs(match, np.diag(products) / own, spread > MOVES, scale)
 
 
