@@ -22,7 +22,7 @@ class MyActuatorSettings(DriveSettings):
     """As on the label or as the drive tells it: its torque constant, where the key below does not give it."""
     torque_constant: Positive | None = None
     """Torque at the output for one ampere [N·m/A]; None: rated torque over rated current of the model."""
-    timeout_ms: Annotated[int, Field(ge=0, le=60_000)] = 0
+    timeout_ms: Annotated[int, Field(ge=0, le=2500)] = 0
     """Time-out of communication (B3h) as it was stored in the drive [ms]; 0: none, the drive keeps on."""
 
     @model_validator(mode="after")
