@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import http.client
 import json
 import resource
 import select
@@ -16,7 +17,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from fast_daemon import FastDaemon
 from made_up_view import MadeUpView
-from served_page import Served, served
+from served_page import TOKEN, Served, served
 
 from calib.daemon import service_view
 from calib.daemon.web import connection, stream
@@ -79,6 +80,27 @@ def test_idle_strangers_on_tcp_lock_nobody_out(
         assert server.client().get("/api/status").status_code == 200
         assert server.tcp().get("/api/status").status_code == 200
     assert len(caplog.records) < 100
+
+
+def test_strangers_displace_the_oldest_stranger_and_nobody_who_has_shown_the_token(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "MOST_STRANGERS", 4)
+    trusted = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    trusted.auto_open = 0  # the connection it has, and no other
+    trusted.connect()
+    before: list[socket.socket] = []
+    with contextlib.ExitStack() as open_ones, contextlib.closing(trusted):
+        for _ in range(3):
+            trusted.request("GET", "/api/status", headers={"Authorization": f"Bearer {TOKEN}"})
+            answer = trusted.getresponse()
+            assert (answer.status, json.loads(answer.read())["state"]) == (200, "observing")
+            now = [
+                open_ones.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=30))
+                for _ in range(4)
+            ]
+            wait_until_cut(before)
+            before = now
 
 
 @pytest.mark.long
