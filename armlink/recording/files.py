@@ -27,7 +27,7 @@ def load_recording(path: str | Path, stated: Corrections | None = None) -> Recor
 def load_recordings(path: str | Path, stated: Corrections | None = None, poses: bool = False) -> dict[str, Recording]:
     """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set.
 
-    `poses`: a CSV table without times is one of poses.
+    `poses`: a CSV table without times is one of poses, and the efforts of a LeRobot data set are read.
     """
     stated = stated or AS_IT_IS
     folder, _, episode = str(path).rpartition("#")
@@ -47,7 +47,7 @@ def _loaded(path: Path, stated: Corrections, poses: bool = False) -> dict[str, R
         require_extra(str(path), "parquet")
         from armlink.recording.lerobot import load_lerobot
 
-        return load_lerobot(path)
+        return load_lerobot(path, efforts=poses)
     if (path / "metadata.yaml").is_file() or path.suffix in (".db3", ".bag"):
         require_extra(str(path), "bags")
         from armlink.recording.ros_bag import load_bag

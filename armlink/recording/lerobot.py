@@ -22,20 +22,26 @@ from armlink.recording.recording import MOST_JOINTS, Recording, default_names, r
 
 STATES, ACTIONS = ("observation.state", "state"), ("action", "actions")
 """Names of the columns of positions and of commands, as recorders and converters write them."""
+EFFORTS = ("observation.effort", "effort")
+"""Names of the column of motor currents or torques, where a recorder writes one."""
 
 
-def load_lerobot(path: Path) -> dict[str, Recording]:
-    """Recordings of all episodes by label (`FOLDER#EPISODE`). Raises BadInput that names what is missing."""
+def load_lerobot(path: Path, efforts: bool = False) -> dict[str, Recording]:
+    """Recordings of all episodes by label (`FOLDER#EPISODE`), with `efforts` as motor torques if they are to be read.
+
+    Raises BadInput that names what is missing.
+    """
     features = _features(path)
     state, action = (next((name for name in known if name in features), known[0]) for known in (STATES, ACTIONS))
-    names, columns = _names(path, features, state), ("episode_index", "timestamp", state, action)
+    effort = [name for name in EFFORTS if efforts and name in features][:1]
+    names, columns = _names(path, features, state), ("episode_index", "timestamp", state, action, *effort)
     if len(names) > MOST_JOINTS:
         raise BadInput(f"{path}: {len(names)} joints in {state}, expected at most {MOST_JOINTS}")
     size, parts = 0, []
     for file in sorted((path / "data").rglob("*.parquet")):
         try:
             with pa_parquet.ParquetFile(file) as content:
-                size += 8 * (2 * len(names) + 2) * content.metadata.num_rows
+                size += 8 * (len(columns[2:]) * len(names) + 2) * content.metadata.num_rows
                 require_size(size, str(path))
                 require_numbers(content, columns, str(file))
                 table = content.read(columns=list(columns), use_threads=THREADS)
@@ -45,19 +51,23 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
         if missing:
             raise BadInput(f"{file}: column {missing[0]} is missing: expected {', '.join(columns)}")
         parts.append(
-            [_values(table[column], file, column, len(names) if column in (state, action) else 0) for column in columns]
+            [_values(table[column], file, column, len(names) if column in columns[2:] else 0) for column in columns]
         )
     if not sum(len(part[0]) for part in parts):
         raise BadInput(
             f"{path}: the Parquet files under data/ have no rows: download the data set together with its data"
         )
-    episodes, times, positions, commands = (np.concatenate(column) for column in zip(*parts, strict=True))
+    episodes, times, positions, commands, *torques = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = {}
     for episode in np.unique(episodes):
         rows = np.flatnonzero(episodes == episode)
         rows = rows[np.argsort(times[rows], kind="stable")]
         found[f"{path}#{episode:.0f}"] = Recording(
-            t=times[rows], position=positions[rows], position_command=commands[rows], names=names
+            t=times[rows],
+            position=positions[rows],
+            position_command=commands[rows],
+            motor_torque=torques[0][rows] if torques else None,
+            names=names,
         )
     return found
 

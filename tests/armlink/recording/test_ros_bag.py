@@ -212,6 +212,18 @@ def test_a_lerobot_data_set_is_a_recording_an_episode(tmp_path):
         load_recording(tmp_path / "set")
 
 
+def test_the_efforts_of_a_lerobot_data_set_are_read_for_poses_alone(tmp_path):
+    lerobot(tmp_path / "set")
+    file = tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet"
+    table = pa_parquet.read_table(file).append_column("observation.effort", pa.array([[3.0, 4.0]] * 5))
+    pa_parquet.write_table(table, file)
+    described = {"observation.state": {"names": ["shoulder.pos", "elbow.pos"]}, "observation.effort": {"shape": [2]}}
+    (tmp_path / "set" / "meta" / "info.json").write_text(json.dumps({"fps": 30, "features": described}))
+    assert all(each.motor_torque is None for each in load_recordings(tmp_path / "set").values())
+    for each in load_recordings(tmp_path / "set", poses=True).values():
+        np.testing.assert_allclose(each.motor_torque[0], [3.0, 4.0])
+
+
 @pytest.mark.parametrize(
     ("name", "column", "says"),
     [
