@@ -205,8 +205,9 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     if set(found) != set(names):
         made = search.improve(about.moved(found), 4)
         if worth(search, made) >= most:
-            fit, about = made, look_about(search, made, looked, levels)
-    return fit, about
+            fit = made
+    # all candidates once more: what the start has explained already may have rivals that were not looked at
+    return fit, look_about(search, fit, levels=levels)
 
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:

@@ -74,10 +74,10 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
     def lost(parts: Sequence[Group]) -> float:
         return float(terms.cost(about.parameters(parts)).sum()) - base
 
-    whole = lost(rest)
+    whole = least = lost(rest)
+    close = list(ALWAYS.get(effect, ()))
     if effect == "controller.stiffness":
-        return whole, _scale_rivals(search, fit, about, chosen)
-    least, close = whole, list(ALWAYS.get(effect, ()))
+        close += _scale_rivals(search, fit, about, chosen)
     for other in sorted({id_of(part) for part in every} - {id_of(group)}):
         parts = [part for part in parts_of((other, joints)) if joints and part in every]
         if not parts:
