@@ -46,7 +46,7 @@ def sentence(answer: Diagnosis) -> str:
 def parameter_rows(cause: Cause) -> list[list[str]]:
     """Rows of a table of what was fitted: effect, joint, parameter, value, interval, unit."""
     return [
-        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
+        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.3g} to {v.high:.3g}", v.unit]
         for joint, values in cause.parameters.items()
         for name, v in values.items()
     ]
