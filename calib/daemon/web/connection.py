@@ -56,6 +56,11 @@ UNKNOWN = Peer("unknown", "unknown", tcp=True)
 """A scope without a peer counts as the least trusted one."""
 
 
+async def until_gone(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
 def peer_of(scope: Scope) -> Peer:
     found = scope.get("state", {}).get(PEER)
     return found if isinstance(found, Peer) else UNKNOWN

@@ -17,7 +17,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
-from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of, until_gone
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,11 @@ class RequestGuard:
         if peer.connection is not None:
             peer.connection.request_begins()
         try:
-            with suppress(h11.LocalProtocolError):  # uvicorn has refused the rest of the request meanwhile
-                await self._pass(scope, peer, receive, send)
+            await self._pass(scope, peer, receive, send)
+        except h11.LocalProtocolError:  # uvicorn has refused the rest of the request meanwhile, and ends the connection
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LINGER_SECONDS):
+                    await until_gone(receive)
         finally:
             if peer.connection is not None:
                 peer.connection.request_ends()

@@ -8,7 +8,7 @@ from contextlib import suppress
 from fastapi.responses import StreamingResponse
 
 from calib.daemon.view import DaemonView, EventItem, EventRecord, JointsItem
-from calib.daemon.web.connection import PATIENCE_SECONDS, Receive, Scope, Send, peer_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, Receive, Scope, Send, peer_of, until_gone
 from calib.daemon.web.history import Histories
 
 MOST_CLIENTS = 200
@@ -62,7 +62,7 @@ class Streams:
         self._tasks[client] = peer_of(scope).owner
         if self._closed:
             client.cancel()
-        gone = asyncio.create_task(_until_gone(receive))
+        gone = asyncio.create_task(until_gone(receive))
         try:
             await asyncio.wait({client, gone}, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -128,8 +128,3 @@ class StreamResponse(StreamingResponse):
 
 async def _send(send: Send, data: bytes, more: bool = True) -> None:
     await send({"type": "http.response.body", "body": data, "more_body": more})
-
-
-async def _until_gone(receive: Receive) -> None:
-    while (await receive())["type"] != "http.disconnect":
-        pass
