@@ -234,7 +234,7 @@ class LinkSection(Section):
 
 
 class Tool(Section):
-    """What the arm carries at its end: a gripper, a hand, a payload. An exchange needs no new calibration."""
+    """A body at the end of the arm: a gripper, a hand, a payload. Its exchange needs no new calibration."""
 
     mass: Positive
     """[kg]"""

@@ -10,7 +10,7 @@ from gcomp.arrays import Array
 
 
 def tool_moments(arm: Arm, tool: Tool | None) -> Array:
-    """What the tool adds to the mass moments (2n,) [kg·m]; equation (P) of docs/theory.md."""
+    """Mass moments that the tool adds (2n,) [kg·m]; equation (P) of docs/theory.md."""
     if tool is None:
         return np.zeros(2 * arm.n)
     at_origin, by_point = payload_columns(arm)
@@ -19,7 +19,7 @@ def tool_moments(arm: Arm, tool: Tool | None) -> Array:
 
 
 def tool_covariance(arm: Arm, tool: Tool | None) -> Array:
-    """Covariance of that (2n, 2n) [kg²·m²]."""
+    """Covariance of the mass moments that the tool adds (2n, 2n) [kg²·m²]."""
     if tool is None:
         return np.zeros((2 * arm.n, 2 * arm.n))
     at_origin, by_point = payload_columns(arm)

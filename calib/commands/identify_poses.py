@@ -110,7 +110,7 @@ def identify_poses(
         raise BadInput("--reference-mass: a mass hangs in all poses: give poses without it, too")
     judged = judged_fit(described, poses, heldout, masses, gain_std, stated)
     fit, arm_file, record = judged.fit, described.arm_file, None
-    if arm_file is not None and arm_file.joint_names:
+    if arm_file is not None:
         kept = fit.gravity.record(arm_file)
         store.put(kept, arm_file, by="armlink identify", reason="poses")
         record = kept.id

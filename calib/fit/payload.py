@@ -1,4 +1,4 @@
-"""What an arm carries beyond its gravity record, weighed at poses: mass and centre of mass with intervals.
+"""Mass and centre of mass, with intervals, of the body that an arm carries beyond its gravity record.
 
 The problem is that of a field calibration, with gains and offsets as doubtful as their record says and four more
 unknowns: the mass and its first moment (docs/theory.md, equation (P)). What the calibration does not explain (cables,
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from calib.fit.creep_fit import SEEN
 from calib.fit.field_fit import UNKNOWN_MOMENT, FieldProblem, scatter_factor
 from calib.fit.pose_fit import rms
 from calib.fit.scatter import NOISE_ROUNDS
@@ -18,9 +19,6 @@ from calib.fit.slow_windows import directions
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
-
-SEEN = 0.3
-"""A moment is found if the readings leave so much of what was doubted beforehand, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
