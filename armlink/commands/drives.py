@@ -3,9 +3,7 @@
 from armlink.commands.options import Json
 
 
-def drives(
-    json: Json = None,
-) -> int:
+def drives(json: Json = None) -> int:
     """List the drive families with their traits: torque, calibration, silence, bounds, cadence, frames.
 
     Example: armlink drives --json -

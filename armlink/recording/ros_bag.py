@@ -17,14 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.bag_sizes import require_bag_sizes
-from armlink.recording.joint_messages import (
-    STATES,
-    TOPICS,
-    JointMessage,
-    left_out,
-    main_joints,
-    recording_of_messages,
-)
+from armlink.recording.joint_messages import STATES, TOPICS, JointMessage, left_out, main_joints, recording_of_messages
 from armlink.recording.recording import Recording, require_size
 from armlink.recording.ros_joint_state import NANO
 

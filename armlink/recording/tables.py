@@ -107,7 +107,7 @@ def recording_of_columns(
     warning = f"columns that are no channels are ignored: {', '.join(ignored)}" if ignored else ""
     n = joint_count(header, source)
     if names and len(names) != n:
-        raise BadInput(f"{source}: {len(names)} joint names for {n} joints")
+        raise BadInput(f"{source}: `armlink.names` has {len(names)} names for {n} joints: give one for each joint")
     return Recording(t=columns["t"], names=names or default_names(n), warning=warning, **channels)  # type: ignore[arg-type]
 
 

@@ -290,8 +290,10 @@ class SelfTest:
         moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
         if (moved > most).any():
             joint = int(np.nanargmax(moved - most))
+            limit = np.broadcast_to(most, moved.shape)[joint]
+            text = f"moved by {moved[joint]:.3f} rad while it should hold (limit {limit:.3g} rad)"
             raise BusFault(
-                f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended"
+                f"{link.names[joint]}: {text}, so the test was ended: check its load, its brake and its gains"
             )
         return sample
 

@@ -34,7 +34,7 @@ def identify(
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
 
-    data, arm_file = load_sweeps("identify", directories, arm)
+    data, arm_file = load_sweeps(directories, arm)
     records = RecordStore(store)
     sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None

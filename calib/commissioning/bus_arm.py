@@ -73,11 +73,7 @@ def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], 
 
 
 def _text(
-    matches: list[Match],
-    stops: list[tuple[float, float]],
-    channel: str,
-    bus: Mapping[str, str | int],
-    name: str,
+    matches: list[Match], stops: list[tuple[float, float]], channel: str, bus: Mapping[str, str | int], name: str
 ) -> str:
     known = matches[0].by_hand
     lines = [

@@ -37,8 +37,8 @@ def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
     model = model_arm(arm_file)
     lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
     if lacking:
-        what = f"the model gives no mass to what turns with {', '.join(lacking)}"
-        remedy = "give these links their masses and centres of mass: demo and torque leave the missing masses out"
+        what = f"the links moved by {', '.join(lacking)} have no mass in the model"
+        remedy = "add their masses and centres of mass to the model: until then demo and torque calculate without them"
         yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 

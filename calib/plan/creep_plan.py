@@ -13,7 +13,7 @@ from calib.plan.collisions import POINTS, Geometry
 from calib.plan.creep_design import CreepCandidate, choose
 from calib.plan.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
-from calib.plan.poses import require_range
+from calib.plan.poses import COLLIDING, require_range
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -180,7 +180,7 @@ def creep_seconds(plan: SweepPlan) -> float:
 def creep_speed(sweep: Sweep) -> float:
     """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
     if sweep.speed is None:
-        raise BadInput(f"sweep {sweep.name} has no speed, so this is a plan of steps at rest, not of creep sweeps")
+        raise BadInput(f"sweep {sweep.name} has no `speed`: set `sweep.motion: steps` in the arm file, or plan again")
     return sweep.speed
 
 
@@ -227,7 +227,7 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
         pose = random.uniform(*ground.ends)
         if ground.free(pose[None]):
             return np.asarray(pose)
-    raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+    raise BadInput(COLLIDING)
 
 
 def _candidates(

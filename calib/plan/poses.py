@@ -16,6 +16,12 @@ UNKNOWN = 1e-6
 Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
+COLLIDING = (
+    "almost every pose within the joint ranges collides: correct the collision shapes of the model, or narrow lower "
+    "and upper in the arm file"
+)
+"""Message of a plan without free poses."""
+
 
 def sweep_range(section: SweepSection, limits: DriveLimits, joint: int) -> tuple[float, float]:
     """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
@@ -42,7 +48,7 @@ def scout_poses(
     if geometry is not None:
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
-            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+            raise BadInput(COLLIDING)
     regressor = gravity_regressor(kinematics, poses)
     offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
@@ -69,7 +75,7 @@ def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(
-                f"joint {name}: range_margin {section.range_margin} rad leaves nothing of its range "
-                f"{limits.lower[joint]} to {limits.upper[joint]} rad to sweep: check lower and upper, or "
-                "reduce range_margin"
+                f"{name}: of its range {limits.lower[joint]:g} to {limits.upper[joint]:g} rad, {last - first:.2f} rad "
+                f"are left to sweep after range_margin ({section.range_margin:g} rad) and 2 % at each end, at least "
+                "0.2 rad are needed: check lower and upper, or reduce range_margin"
             )

@@ -66,14 +66,15 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
-        needed = " ".join(f"{torque:.1f}" for torque in strongest.min(axis=0))
+        needs = zip(planned.kinematics.names, strongest.min(axis=0), limits.max_torque, strict=True)
+        needed = ", ".join(f"{each} {torque:.1f} of {most:g} N·m" for each, torque, most in needs)
         raise BadInput(
-            f"joint {name} cannot be swept: gravity needs up to {needed} N·m, so in no combination of stops "
-            "can max_torque hold the arm; sweep a lighter arm, or allow more torque"
+            f"{name}: no combination of stops can be held for its sweep: gravity needs at least these shares of "
+            f"max_torque: {needed}: sweep a lighter arm, or raise max_torque"
         )
     note = (
-        f"in sweeps of {name}, max_torque can press the other joints on their stops in too few poses, so in some "
-        "sweeps their position loops hold them"
+        f"{name}: in some of its sweeps the other joints are held by their position loops, since max_torque cannot "
+        "press them on their stops in enough poses"
     )
     return with_lever(everything.kept(pressed | holdable)), [note]
 

@@ -21,14 +21,7 @@ def write_report(
         f"Gravity record {gravity.id} compared with the torque sensors with {sensors}, at "
         f"{len(result.sensor)} random poses that were used for no fit.{skipped}"
     )
-    header = (
-        "joint",
-        "RMS [N·m]",
-        "allowed RMS",
-        "largest [N·m]",
-        "standard deviation of the model",
-        "largest torque",
-    )
+    header = ("joint", "RMS [N·m]", "allowed RMS", "largest [N·m]", "standard deviation of the model", "largest torque")
     numbers = (
         result.rms,
         result.tolerance,

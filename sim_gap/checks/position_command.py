@@ -107,7 +107,7 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
         if match[j, j] < -FOLLOWS and not stated.states("sign", column):
             raise BadInput(
                 f"{label}: {name}: q_{j + 1} moves in the direction opposite to {column} (correlation "
-                f"{match[j, j]:.2f}): give --sign {column}=-1"
+                f"{match[j, j]:.2f}): give --sign {column}=-1 or, if q has the wrong sign, --sign q_{j + 1}=-1"
             )
         if match[j, j] > CLEARLY and not SCALE[0] < slope[j] < SCALE[1] and not stated.states("units", column):
             unit = f"q_cmd_{j + 1}=deg" if slope[j] < 1.0 else f"q_{j + 1}=deg"

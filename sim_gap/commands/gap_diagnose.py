@@ -100,8 +100,8 @@ def diagnose(
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and a module "
-            "beside it for effects that MJCF cannot hold."
+            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and beside it a "
+            "Python module for effects that the format cannot express."
         ),
     ] = None,
 ) -> None:

@@ -24,17 +24,7 @@ from armlink.drives.moteus.frames import (
     WRITE,
     MoteusRegister,
 )
-from armlink.drives.orders import (
-    DriveIdentity,
-    Limits,
-    Mode,
-    Order,
-    Power,
-    Reading,
-    Setup,
-    real32_step,
-    real32_within,
-)
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup, real32_step, real32_within
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits

@@ -142,7 +142,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         if abs(found - value) > TOLERANCE * abs(value):
             raise BusFault(
                 f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g}, but reads "
-                f"back {found:g}: {otherwise}"
+                f"back {found:g}: {otherwise}; update the firmware, or write it with the maker's tool"
             )
 
     # ---- before the cycle
@@ -300,7 +300,9 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
         # a host that has set up a drive since its power-on has set the limit, and with it the deadman
         models = [] if timeout != 0 else [name for name, ranges in RANGES.items() if ranges.torque == limit]
         model = (*models, MOST_TORQUE)[0]
-        why = "has its torque limit as delivered" if models else "any other then makes less than is asked of it"
+        why = "the drive's torque limit is the factory value of this model"
+        if not models:
+            why = "it has the largest torque range, so any other model makes less torque than commanded, never more"
         each = FoundDrive(
             *("robstride", motor, f"motor {motor}", {"id": motor, "model": model, "kp": 0.0, "kd": 0.0}),
             max_torque=RANGES[model].torque,

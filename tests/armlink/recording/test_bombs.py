@@ -128,7 +128,7 @@ def test_a_chunk_that_says_less_than_it_unpacks_to(tmp_path, pack):
     refused(tmp_path / "r.mcap", "no sensor_msgs/msg/JointState on /joint_states; cut recording")
     much = struct.pack("<QQQI", 0, 0, 1 << 40, 0) + packed[28:]
     (tmp_path / "r.mcap").write_bytes(begin + b"\x06" + struct.pack("<Q", len(much)) + much)
-    refused(tmp_path / "r.mcap", "has a chunk of 1099511627776 bytes, expected at most")
+    refused(tmp_path / "r.mcap", "a chunk unpacks to 1099512 MB, expected at most")
 
 
 @pytest.mark.parametrize("inside", [False, True])
