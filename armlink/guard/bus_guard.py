@@ -293,8 +293,8 @@ class Policy:
             )
         if not frame.after <= self._acknowledged:
             return (
-                f"the program sent {can_id:X}h, but since the guard or the drive started the drive has not "
-                "acknowledged what this frame means"
+                f"the program sent {can_id:X}h, but the drive has not acknowledged the meaning of this frame since it "
+                "or the guard started: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:
@@ -436,7 +436,7 @@ class BusGuard:
             if port.lost and not self.closed:
                 self.close(
                     f"{port.lost} frames from the {name} were lost: too many frames were sent, or this guard gets "
-                    "too little processor time"
+                    "too little CPU time"
                 )
 
     def _tell_late(self, age: float) -> None:

@@ -166,7 +166,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointMessage]], str]:
     if complete:
         return found, ""
     rows = len(found.get(STATES, []))
-    return found, f"cut recording ({why}): the first {rows} rows were loaded, up to about byte {position}"
+    return found, f"truncated recording ({why}): the first {rows} rows were loaded, up to about byte {position}"
 
 
 def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:

@@ -50,7 +50,7 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({}), stat
     arrays = read_numbers(content, layout, places, str(path))
     loaded = recording_of_columns(arrays, header, str(path), names_of_columns(columns, header))
     if cut:
-        cut = f"cut recording ({cut}): the first {loaded.t.size} rows were loaded"
+        cut = f"truncated recording ({cut}): the first {loaded.t.size} rows were loaded"
         loaded = replace(loaded, warning="; ".join(filter(None, (cut, loaded.warning))))
     return loaded
 

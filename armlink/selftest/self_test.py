@@ -142,7 +142,7 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                told = "no calibration record is in force: the torque is used as the drive reports it"
+                told = "there is no current calibration record: the torque is used as the drive reports it"
                 self.checks.add(name, "calibration", "absent", told)
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"

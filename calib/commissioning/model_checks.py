@@ -87,14 +87,14 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             yield SetupFinding(
                 "warning",
                 f"gravity does not load this joint, since {axis}, so its torque gain cannot be found (Γ/g, "
-                f"the share of gravity that it feels, is {lever[joint]:.2f})",
+                f"the share of gravity that acts on it, is {lever[joint]:.2f})",
                 name,
                 "incline the base for the sweeps, or accept that this gain stays unknown",
             )
         elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
-                "gravity loads this joint only a little (Γ/g, the share of gravity that it feels, is at most "
+                "gravity loads this joint only a little (Γ/g, the share of gravity that acts on it, is at most "
                 f"{lever[joint]:.2f}), so its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",

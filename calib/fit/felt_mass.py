@@ -32,7 +32,7 @@ class FeltMass:
 
     def __str__(self) -> str:
         return (
-            f"the loaded pass feels {self.felt:.1f} kg, but --reference-mass was {self.stated:g} kg: was the "
+            f"the loaded pass shows {self.felt:.1f} kg, but --reference-mass was {self.stated:g} kg: was the "
             "mass attached, and is the number right?"
         )
 

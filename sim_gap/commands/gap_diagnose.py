@@ -72,14 +72,14 @@ def diagnose(
         int,
         typer.Option(
             min=0,
-            help="Write this number of random draws of all parameters, for domain randomisation.",
+            help="Write this number of random samples of all parameters, for domain randomisation.",
             rich_help_panel="For training in simulation",
         ),
     ] = 0,
     out_samples: Annotated[
         Path | None,
         typer.Option(
-            help="File for the draws: .csv, .json or .parquet; by default samples.csv.",
+            help="File for the samples: .csv, .json or .parquet; by default samples.csv.",
             rich_help_panel="For training in simulation",
         ),
     ] = None,
@@ -213,11 +213,11 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
-        console.print("no draws were written, since there is no gap that parameters could explain", style="yellow")
+        console.print("no samples were written, since there is no gap that parameters could explain", style="yellow")
         return
     else:
         write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
-    console.print(f"{count} draws of all parameters were written to {target}")
+    console.print(f"{count} samples of all parameters were written to {target}")
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:

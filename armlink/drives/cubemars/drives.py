@@ -239,7 +239,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     """By answers to another host that are heard, its commands too; nothing in them tells a model."""
     commanded = {can_id for can_id, data in bus.heard if len(data) == 8}
     heard = {(*data[:1], can_id) for can_id, data in bus.heard if can_id <= 0x7F and len(data) in (6, 8)}
-    note = "its model is not told: write its keys by hand"
+    note = "the drive does not report its model: write its keys by hand"
     return [
         FoundDrive("cubemars", drive, f"id {drive:02X}h", reply=reply, note=note)
         for drive, reply in sorted(heard)
@@ -247,6 +247,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-SEARCH = Discovery("only heard: whatever asks them commands them", find_drives, ("damiao", "odrive"))
+SEARCH = Discovery("only listened for: every request to them is also a command", find_drives, ("damiao", "odrive"))
 SUMMARY = "CubeMars AK (firmware 1 and 2), MIT mode"
 FAMILY = Family("cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, discovery=SEARCH, summary=SUMMARY)

@@ -174,7 +174,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
             )
         most = min(limits.max_torque, grid.t)
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
-        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")
+        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the drive would not limit its torque")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
         otherwise = "the drive would keep on with its last command after its host died"
         self._set(ask, joint, RobStrideParameter.TIMEOUT, deadman, otherwise)

@@ -80,7 +80,7 @@ class RecalibrationWorkflow:
                 with self._journal.transaction():
                     self._applied(row, row.by or "daemon", current)
             else:
-                note = "interrupted before it was in force"
+                note = "interrupted before it became current"
                 self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
         return last
 
@@ -175,7 +175,7 @@ class RecalibrationWorkflow:
             raise NotPossible("another recalibration is under way: try again in a moment")
         current = recalibrator.record.id
         if row.base != current:
-            raise NotPossible(f"proposal {number} follows from record {row.base}, but record {current} is in force now")
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but record {current} is current now")
 
         def approved() -> None:
             self._approved.append((row, by))
@@ -210,7 +210,7 @@ class RecalibrationWorkflow:
         recalibrator, joint = self._active(), self._names.index(row.joint)
         current = recalibrator.record.id
         if row.base != current:
-            self._keep_failure(row, Refused(f"record {current} came into force before it was written"))
+            self._keep_failure(row, Refused(f"record {current} became current before it was written"))
             return
 
         def work() -> CalibrationRecord:
@@ -270,7 +270,7 @@ class RecalibrationWorkflow:
         self._checking = (row.joint,)
         joint = record.joints[row.finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
-        text = f"{row.joint}: record {record.id} is in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
+        text = f"{row.joint}: record {record.id} is current: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
         evidence = {"proposal": row.number, "record": record.id, "replaces": row.base, "by": by, "applied": True}
         self._decided(row, "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
@@ -375,7 +375,9 @@ class RecalibrationWorkflow:
 
     def _active(self) -> Recalibrator:
         if self._recalibrator is None:
-            raise NotPossible("no calibration and gravity records are in force yet: the status says what is missing")
+            raise NotPossible(
+                "there are no current calibration and gravity records yet: the status says what is missing"
+            )
         return self._recalibrator
 
     def _named(self, number: int, digest: str | None = None) -> ProposalRow:

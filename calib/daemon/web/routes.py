@@ -102,7 +102,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
 def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     @router.get("/api/status", tags=["now"])
     async def status() -> Status:
-        """State of daemon and bus, records in force."""
+        """State of daemon and bus, current records."""
         return view.status()
 
     @router.get("/api/joints", tags=["now"])

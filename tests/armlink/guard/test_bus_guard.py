@@ -742,7 +742,7 @@ def test_lost_frames_close_it(wires, side, name):
     wire.say(0x181, bytes(8))
     guard.step(1.0)
     assert guard.closed == (
-        f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little processor time"
+        f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little CPU time"
     )
 
 

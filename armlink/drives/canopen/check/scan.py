@@ -234,7 +234,7 @@ def scan_report(
     write(json, {"bus": channel, "nodes": [_answer(each, wrong.get(each.node, [])) for each in found]})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
     if missing:
-        raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
+        raise BusFault(f"no answer from {', '.join(missing)} on {channel}: check power, wiring and ids")
     _require_own_ids(found, channel)
     if wrong:
         node, differs = next(iter(wrong.items()))
