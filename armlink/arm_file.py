@@ -337,7 +337,7 @@ class ArmFile(Section):
         """The section `name`, typed; raises BadInput where the file has none."""
         section = getattr(self, name)
         if not isinstance(section, kind):
-            raise BadInput(f"{self.path}: key `{name}` is missing: this command needs it")
+            raise BadInput(f"{self.path}: this command needs the section `{name}`: add it (docs/formats.md)")
         return section
 
 

@@ -253,7 +253,7 @@ def _arm(arm: object) -> ArmFile:
 
 def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
     if not sweeps:
-        raise BadInput(f"{function}: give data sets of sweep, or their folders")
+        raise BadInput(f"{function}: give at least one data set that `sweep` wrote (SweepData, or its folder)")
     given: list[Path | SweepData] = []
     for each in sweeps:
         if not isinstance(each, SweepData | str | Path):

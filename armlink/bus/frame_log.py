@@ -176,7 +176,9 @@ class LogReader:
         first = None
         for message in self._messages():
             if not math.isfinite(message.timestamp):
-                self.warning = f"cut frame log (a time is not a number): the first {self.count} frames were loaded"
+                self.warning = (
+                    f"truncated frame log (a time is not a number): the first {self.count} frames were loaded"
+                )
                 return
             stamp = round(message.timestamp * 1e6)
             first = stamp if first is None else first
@@ -201,7 +203,7 @@ class LogReader:
         except OSError as error:
             raise BadInput(f"{self._path}: cannot read it: {error.strerror or error}") from None
         if why:
-            self.warning = f"cut frame log ({why}): the first {self.count} frames were loaded"
+            self.warning = f"truncated frame log ({why}): the first {self.count} frames were loaded"
 
     def _from_blf(self) -> Generator[can.Message, None, str]:
         size = self._path.stat().st_size
@@ -259,9 +261,9 @@ def _require_containers(stream: Any, path: Path) -> None:
             return  # said by python-can
         _, _, _, length, kind = OBJ_HEADER_BASE_STRUCT.unpack(head)
         if length > MOST_CONTAINER:
-            raise BadInput(f"{path}: contains an object of {length} bytes, expected at most {MOST_CONTAINER}")
+            raise BadInput(f"{path}: is damaged: an object of {length} bytes, expected at most {MOST_CONTAINER}")
         if kind == LOG_CONTAINER and _unpacks_to_more(_at(stream, place, length)[OBJ_HEADER_BASE_STRUCT.size :]):
-            raise BadInput(f"{path}: an object unpacks to more than {MOST_CONTAINER} bytes")
+            raise BadInput(f"{path}: is damaged: an object unpacks to more than {MOST_CONTAINER} bytes")
         place += max(length + length % 4, OBJ_HEADER_BASE_STRUCT.size)
 
 

@@ -96,9 +96,8 @@ def check(
     failed = [each for each in found if each.outcome == "failed"]
     write_json(json, _answer(described.name, described.serial, channel, found))
     if any(each.check == "answers" for each in failed):
-        raise BusFault(
-            f"no answer from {', '.join(each.joint for each in failed if each.check == 'answers')} on {channel}"
-        )
+        silent = ", ".join(each.joint for each in failed if each.check == "answers")
+        raise BusFault(f"no answer from {silent} on {channel}: check power, wiring and ids")
     if failed:
         first = failed[0]
         raise Refused(
@@ -213,7 +212,7 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     out = results(json)
     out.print(
         f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %), "
-        f"{late['max']:.2f} (longest); each cycle took {report.busy * 1e3:.2f} ms of processor time; {report.realtime}",
+        f"{late['max']:.2f} (longest); each cycle took {report.busy * 1e3:.2f} ms of CPU time; {report.realtime}",
     )
     out.print(f"this machine can keep {report.holds_hz:g} Hz; the arm file asks for {section.rate:g} Hz")
     limit = WARN_SHARE * section.deadline * 1e3

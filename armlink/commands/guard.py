@@ -10,7 +10,7 @@ from armlink.commands.options import OtherBus
 
 def guard(
     arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the policy to this JSON file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write; required unless --path is given.")] = None,
     path: Annotated[bool, typer.Option("--path", help="Print only the path of the guard's Python file.")] = False,
     bus: OtherBus = None,
 ) -> int:

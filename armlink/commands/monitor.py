@@ -36,8 +36,7 @@ def monitor(
         ),
     ] = False,
     foxglove: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, metavar="PORT", help="Serve readings to Foxglove; 0: a free port."),
+        int | None, typer.Option(min=0, max=65535, metavar="PORT", help="Serve readings to Foxglove; 0: a free port.")
     ] = None,
     rerun: Annotated[
         int | None,

@@ -41,6 +41,7 @@ def record(
     from armlink.commands.plain_console import results
     from armlink.errors import BadInput, BusFault
     from armlink.extras import require_extra
+    from armlink.recording.files import SUFFIXES
     from armlink.recording.recorder import Recorder
 
     arm_file = load_arm(arm)
@@ -48,7 +49,8 @@ def record(
         raise BadInput("record: nothing to write: give a .mcap file, or `--frames` with a .asc, .blf or .log file")
     if out is not None and out.suffix != SUFFIX:
         first = out.with_suffix(SUFFIX)
-        raise BadInput(f"{out}: record writes {SUFFIX} files: record {first}, then run `armlink convert {first} {out}`")
+        then = f", then run `armlink convert {first} {out}`" if out.name.endswith(SUFFIXES) else ""
+        raise BadInput(f"{out}: record writes {SUFFIX} files: give {first}{then}")
     if out is not None:
         require_extra(str(out), "bags")
         from armlink.recording.mcap import RecordingWriter

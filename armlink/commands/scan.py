@@ -93,7 +93,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     write_json(json, {"bus": channel, "nodes": nodes})
     missing = [f"{link.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:
-        raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
+        raise BusFault(f"no answer from {', '.join(missing)} on {channel}: check power, wiring and ids")
     wrong = [f"{link.names[each.joint]} ({each.address}): {each.mismatch}" for each in found if each.mismatch]
     if wrong:
         raise Refused(

@@ -21,7 +21,7 @@ MOST_NODES = 200_000
 def read_whole(path: Path, most: int = MOST_SMALL) -> bytes:
     """The content of a file of at most `most` bytes; raises BadInput beyond that and for a device, OSError."""
     if path.exists() and not path.is_file():
-        raise BadInput(f"{path}: is not a file: expected a file of at most {most / 1e6:.0f} MB")
+        raise BadInput(f"{path} is a folder or a device: give a file")
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:

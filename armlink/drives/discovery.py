@@ -48,7 +48,7 @@ class AskedDrives:
         found = dict(zip((each.address for each in self.found), self._drives.positions(self._bus), strict=True))
         silent = [address for address, position in found.items() if position != position]
         if silent:
-            raise BusFault(f"{self._bus.channel_info}: {', '.join(silent)}: no position at the output is told")
+            raise BusFault(f"{self._bus.channel_info}: {', '.join(silent)}: no position at the output is reported")
         return found
 
 

@@ -55,7 +55,7 @@ class Source:
 
     def __init__(self, found: dict[str, Any]) -> None:
         self.id, self.prefix = int(found["frame"]), bytes.fromhex(found.get("prefix", ""))
-        self.at, self.number = int(found["at"]), _number(found["code"])
+        self.at, self.number = int(found["at"]), _number(found)
 
     def value(self, data: bytes) -> float | None:
         if not data.startswith(self.prefix) or len(data) < self.at + self.number.size:
@@ -77,7 +77,7 @@ class Field:
 
     def __init__(self, found: dict[str, Any]) -> None:
         """From the policy; raises PolicyError for a field without bounds."""
-        self.name, self.at, self.number = str(found["name"]), int(found["at"]), _number(found["code"])
+        self.name, self.at, self.number = str(found["name"]), int(found["at"]), _number(found)
         self.values = None if found.get("values") is None else frozenset(found["values"])
         self.least, self.most = _bound(found, "least", -math.inf), _bound(found, "most", math.inf)
         self.rate, self.slack = _bound(found, "rate", math.inf), _bound(found, "slack", 0.0)
@@ -292,8 +292,8 @@ class Policy:
             )
         if not frame.after <= self._acknowledged:
             return (
-                f"the program sent {can_id:X}h, but since the guard or the drive started the drive has not "
-                "acknowledged what this frame means"
+                f"the program sent {can_id:X}h, but the drive has not acknowledged the meaning of this frame since it "
+                "or the guard started: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:
@@ -413,11 +413,13 @@ class BusGuard:
             self._tell_late(now - came)
             return
         self._late = False
-        why = "the program sent a remote or error frame" if can_id & (ERROR | REMOTE) else ""
+        why = ""
+        if can_id & (ERROR | REMOTE):
+            why = f"the program sent {can_id & 0x1FFFFFFF:X}h as a remote or error frame, which no policy allows"
         if not why and self.policy.fd not in (None, fd):
             why = (
-                f"the program sent {can_id:X}h as {'CAN FD' if fd else 'classical CAN'}, which these drives do not "
-                "understand"
+                f"the program sent {can_id:X}h as {'CAN FD' if fd else 'classical CAN'}, but by the policy (`fd`) this "
+                f"bus carries only {'classical CAN' if fd else 'CAN FD'}"
             )
         why = why or self.policy.refusal(can_id, data, came)
         if why:
@@ -433,7 +435,7 @@ class BusGuard:
             if port.lost and not self.closed:
                 self.close(
                     f"{port.lost} frames from the {name} were lost: too many frames were sent, or this guard gets "
-                    "too little processor time"
+                    "too little CPU time"
                 )
 
     def _tell_late(self, age: float) -> None:
@@ -455,9 +457,10 @@ class BusGuard:
         self._say(f"guard: closed, it passes no more frames: {why}; {then}; start the guard again to open it")
 
 
-def _number(code: str) -> struct.Struct:
+def _number(found: dict[str, Any]) -> struct.Struct:
+    code = found["code"]
     if len(code) != 1 or code not in NUMBERS:
-        raise PolicyError(f"number code {code!r} is unknown, expected one of {', '.join(NUMBERS)}")
+        raise PolicyError(f"{found.get('name', 'reading')}: number code {code!r}, expected one of {', '.join(NUMBERS)}")
     return struct.Struct("<" + code)
 
 

@@ -74,8 +74,8 @@ def refusal(
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
                 f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, the limit is "
-                f"{limit.servo_overspeed:.3g} (max_velocity and a margin){_by_positions(now, other)}: something "
-                "else moves the joint, or its position loop is unstable"
+                f"{limit.servo_overspeed:.3g} rad/s (3 × max_velocity, at least 3 rad/s){_by_positions(now, other)}: "
+                "something else moves the joint, or its position loop is unstable"
             )
         if why == gate.FOLLOWING:
             return (
@@ -86,7 +86,7 @@ def refusal(
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, the limit is "
-                f"{gate.speed_limit(limit, other):.3g} (max_velocity and a margin){_by_positions(now, other)}: "
+                f"{gate.speed_limit(limit, other):.3g} rad/s (1 to 1.4 × max_velocity){_by_positions(now, other)}: "
                 "command less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:

@@ -89,7 +89,7 @@ def _cells(line: str, separator: str, source: str) -> list[str]:
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error as error:
-        raise BadInput(f"{source}: not a readable CSV file: {error}") from None
+        raise BadInput(f"{source}: its first rows cannot be read as CSV: {error}") from None
 
 
 def _is_values(line: str) -> bool:

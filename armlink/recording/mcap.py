@@ -164,7 +164,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointMessage]], str]:
     if complete:
         return found, ""
     rows = len(found.get(STATES, []))
-    return found, f"cut recording ({why}): the first {rows} rows were loaded, up to about byte {position}"
+    return found, f"truncated recording ({why}): the first {rows} rows were loaded, up to about byte {position}"
 
 
 def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
@@ -181,7 +181,8 @@ def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
 def require_chunk_size(chunk: Chunk, path: Path) -> None:
     """Raise BadInput where a chunk states that it unpacks to more than a recording may hold."""
     if chunk.uncompressed_size > MOST_CHUNK:
-        raise BadInput(f"{path}: has a chunk of {chunk.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
+        size = f"a chunk unpacks to {chunk.uncompressed_size / 1e6:.0f} MB, expected at most {MOST_CHUNK / 1e6:.0f} MB"
+        raise BadInput(f"{path}: {size}: the file is damaged, or has to be written with smaller chunks")
 
 
 def most_record(path: Path) -> int:

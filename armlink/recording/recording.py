@@ -179,7 +179,7 @@ def _check_time(t: Array, source: str) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         row = back[0] + 1
-        remedy = " (write times with more digits, or the times at which the values were sampled)"
+        remedy = " (write times with more digits, or the times of sampling instead of the times of receipt)"
         alike = remedy if t[row] == t[row - 1] else ""
         raise BadInput(
             f"{source}: row {row + 1}: t is {t[row]:.9g} after {t[row - 1]:.9g}, but time must increase{alike}"

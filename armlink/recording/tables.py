@@ -59,7 +59,7 @@ def load_csv(
         header, arrays = [*header, "t"], {**arrays, "t": np.arange(len(next(iter(arrays.values()))), dtype=float)}
     loaded = recording_of_columns(arrays, header, str(path), names_of_columns(columns, header))
     if cut:
-        cut = f"cut recording ({cut}): the first {loaded.t.size} rows were loaded"
+        cut = f"truncated recording ({cut}): the first {loaded.t.size} rows were loaded"
         loaded = replace(loaded, warning="; ".join(filter(None, (cut, loaded.warning))))
     return loaded
 
@@ -109,7 +109,7 @@ def recording_of_columns(
     warning = f"columns that are no channels are ignored: {', '.join(ignored)}" if ignored else ""
     n = joint_count(header, source)
     if names and len(names) != n:
-        raise BadInput(f"{source}: {len(names)} joint names for {n} joints")
+        raise BadInput(f"{source}: `armlink.names` has {len(names)} names for {n} joints: give one for each joint")
     return Recording(t=columns["t"], names=names or default_names(n), warning=warning, **channels)  # type: ignore[arg-type]
 
 

@@ -132,7 +132,7 @@ def measure_host(arm: ArmFile, seconds: float) -> HostReport:
                         return message
                 _work(random, file.fileno())
     except Closed:
-        raise BusFault("check --host: the process that measures has ended") from None
+        raise BusFault("check --host: the measuring process ended (see its error above): repeat the command") from None
     finally:
         process.kill()
         process.wait()

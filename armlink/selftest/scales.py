@@ -268,5 +268,5 @@ def against_current(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
     sigma = math.sqrt(float((left**2).mean()) / float((expected**2).sum())) / max(abs(ratio), 1e-9)
     if ratio <= 0 or sigma > LAW_SIGMA:
         return None
-    text = f"its torque is {ratio:.3g} times the product of current and torque constant"
+    text = f"the torque that it reports is {ratio:.3g} × current × torque constant"
     return Evidence(text, ratio, max(FLOOR, sigma), {"torque": -1})

@@ -167,7 +167,7 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                told = "no calibration record is in force: the torque is used as the drive reports it"
+                told = "there is no current calibration record: the torque is used as the drive reports it"
                 self.checks.add(name, "calibration", "absent", told)
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
@@ -315,8 +315,10 @@ class SelfTest:
         moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
         if (moved > most).any():
             joint = int(np.nanargmax(moved - most))
+            limit = np.broadcast_to(most, moved.shape)[joint]
+            text = f"moved by {moved[joint]:.3f} rad while it should hold (limit {limit:.3g} rad)"
             raise BusFault(
-                f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended"
+                f"{link.names[joint]}: {text}, so the test was ended: check its load, its brake and its gains"
             )
         return sample
 

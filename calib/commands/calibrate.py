@@ -64,7 +64,7 @@ def calibrate(
 
     if report is not None:
         require_extra("--report", "reports")
-    data, arm_file = load_sweeps("calibrate", directories, arm)
+    data, arm_file = load_sweeps(directories, arm)
     if flash and all_creep(data):
         raise BadInput("--flash: the host keeps the calibration of these drives: leave the option out")
     fit = calibrated(arm_file, data)

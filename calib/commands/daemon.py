@@ -36,7 +36,10 @@ def daemon(
     ] = None,
     token_file: Annotated[
         Path | None,
-        typer.Option(help="File with the token that TCP clients must send.", rich_help_panel="Page and API"),
+        typer.Option(
+            help="File with the token that TCP clients must send: at least 16 characters.",
+            rich_help_panel="Page and API",
+        ),
     ] = None,
     policy: Annotated[
         Literal["observe", "propose", "apply"] | None,

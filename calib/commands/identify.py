@@ -101,7 +101,7 @@ def identify(
     for name, value in of_poses.items():
         if value is not None and (value or name == "gain_std"):
             raise BadInput(f"--{name.replace('_', '-')}: only for poses: give the robot's model with --model")
-    sweeps, arm_file = load_sweeps("identify", data, arm)
+    sweeps, arm_file = load_sweeps(data, arm)
     sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None
     if calibration is None:

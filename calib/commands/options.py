@@ -99,12 +99,9 @@ def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore
     return np.array(kept.carrying(arm_file).beta), f"gravity record {kept.id}"
 
 
-def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
+def load_sweeps(directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
     """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
-    from armlink.errors import BadInput
     from calib.dataset import data_sets
 
-    if not directories:
-        raise BadInput(f"{command}: give the directories that sweep wrote")
     data = data_sets(directories)
     return data, data[0].load_arm(arm)

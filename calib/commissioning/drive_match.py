@@ -276,5 +276,5 @@ def drive_notes(drive: FoundDrive, rating: bool = True) -> list[str]:
     if drive.largest_gains is not None:
         notes.append("kp, kd assumed: the torque range over one radian, damped as armlink doctor asks")
     if rating and not math.isfinite(drive.rated_torque):
-        notes.append("rated_torque, max_torque assumed: the drive does not tell them; take them from its data sheet")
+        notes.append("rated_torque, max_torque assumed: the drive does not report them; take them from its data sheet")
     return [note for note in notes if note]

@@ -172,8 +172,8 @@ def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
     model = model_arm(arm_file)
     lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
     if lacking:
-        what = f"the model gives no mass to what turns with {', '.join(lacking)}"
-        remedy = "give these links their masses and centres of mass: demo and torque leave the missing masses out"
+        what = f"the links moved by {', '.join(lacking)} have no mass in the model"
+        remedy = "add their masses and centres of mass to the model: until then demo and torque calculate without them"
         yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
@@ -222,14 +222,14 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             yield SetupFinding(
                 "warning",
                 f"gravity does not load this joint, since {axis}, so its torque gain cannot be found (Γ/g, "
-                f"the share of gravity that it feels, is {lever[joint]:.2f})",
+                f"the share of gravity that acts on it, is {lever[joint]:.2f})",
                 name,
                 "incline the base for the sweeps, or accept that this gain stays unknown",
             )
         elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
-                "gravity loads this joint only a little (Γ/g, the share of gravity that it feels, is at most "
+                "gravity loads this joint only a little (Γ/g, the share of gravity that acts on it, is at most "
                 f"{lever[joint]:.2f}), so its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",

@@ -284,8 +284,9 @@ class Daemon:
         from armlink.link.joints.values import try_limits
 
         arm = load_arm(self.options.arm)
-        if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
-            raise BadInput(f"{arm.path}: this is another arm, serial or kinematics: restart the daemon to use it")
+        changed = [key for key in ("name", "serial", "kinematics") if getattr(arm, key) != getattr(self.arm, key)]
+        if changed:
+            raise BadInput(f"{arm.path}: its {' and '.join(changed)} changed: restart the daemon to use this file")
         resolve_bus(self.options.bus, arm.require_link().bus)
         try_limits(arm)
         return arm, self.options.settings(arm)

@@ -181,7 +181,7 @@ class Service:
     def _say_set_aside(self) -> None:
         aside, self.journal.set_aside = self.journal.set_aside, ""
         if aside:
-            text = f"the journal was damaged: it was moved to {aside}, and a new journal was begun"
+            text = f"the journal was damaged: it was moved to {aside}, and a new, empty journal was begun"
             self.events.say("fault", None, text, {"file": aside})
 
     def _report_found(self, found: Path | Exception | None) -> None:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from calib.fit.calibration import NOISE_ROUNDS
 from calib.fit.creep_fit import SEEN
 from calib.fit.field_fit import UNKNOWN_MOMENT, FieldProblem, scatter_factor
 from calib.fit.pose_fit import rms
-from calib.fit.scatter import NOISE_ROUNDS
 from calib.fit.slow_windows import directions
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array, Mask

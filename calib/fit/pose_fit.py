@@ -9,10 +9,11 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from calib.fit.calibration import NOISE_ROUNDS
 from calib.fit.creep_fit import LEAST_COULOMB, SEEN
+from calib.fit.creep_residuals import LEAST_STD_SHARE, inflation
 from calib.fit.field_fit import BLOCK
 from calib.fit.gravity_fit import GravityFit
-from calib.fit.scatter import LEAST_STD_SHARE, NOISE_ROUNDS, inflation
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import VERTICAL
 from gcomp.arrays import Array, Mask

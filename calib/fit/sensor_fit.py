@@ -41,7 +41,7 @@ def mass_complaint(arm: Arm, readings: StaticReadings) -> str | None:
     if felt is None or LEAST <= felt / stated <= MOST:
         return None
     return (
-        f"the loaded pass feels {felt:.1f} kg, but --reference-mass was {stated:g} kg: was the "
+        f"the loaded pass shows {felt:.1f} kg, but --reference-mass was {stated:g} kg: was the "
         "mass attached, and is the number right?"
     )
 
@@ -91,8 +91,8 @@ WIDE = 0.005
 """Half width of a gain's 95 % interval, as a share of it, from which it is listed as imprecise: the error that
 tests/campaigns/random_arms.py allows a gain."""
 COMMON = (
-    "the common scale of the gains comes from the levers between the axes before the last axis, which are too short on "
-    "this arm; measure where the reference mass hangs (sweep.reference_point), or use a heavier mass"
+    "all gains share this error: their common scale comes from the reference mass and the distances between the joint "
+    "axes, which are too short; measure where the reference mass hangs (sweep.reference_point), or use a heavier one"
 )
 """Reason for a low precision of all gains together."""
 
@@ -291,6 +291,6 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
                 return "no readings with a reference mass: only ratios of gains are determined"
             remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
             if sentence.count(",") > 6:  # too many parameters to name
-                return f"not identifiable: other values fit the data equally well{remedy}"
+                return f"other values fit the data equally well{remedy or ': sweep more joints, in more poses'}"
             return f"{sentence}{remedy}"
     return "the readings do not determine it"

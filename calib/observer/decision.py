@@ -108,7 +108,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
             cause = "offset"  # explained as well without the gain, which keeps its value
             change, covariance = test.drift(joint, cause, beside)
         else:
-            refused.append("the lever of gravity is too short to find a gain" if weak_lever else std)
+            refused.append("gravity loads this joint too little to find a gain" if weak_lever else std)
     if covariance[1, 1] > offset_std**2:
         refused.append(
             f"the offset is known only to ± {np.sqrt(covariance[1, 1]):.3f} N·m, but ± {offset_std:.3g} N·m is required"

@@ -134,11 +134,7 @@ class Observer:
 
     def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, at poses like the latest ones."""
-        key = (
-            self._tracking.rows // AUDIT_ROWS,
-            self._tracking.belief.learnt,
-            self._tracking.belief.level.rows,
-        )
+        key = (self._tracking.rows // AUDIT_ROWS, self._tracking.belief.learnt, self._tracking.belief.level.rows)
         if self._limits is None or self._limits[0] != key:
             self._limits = (key, self._tracking.limits(self._investigation.window[-LONGEST_WINDOW:]))
         return self._limits[1]

@@ -233,7 +233,7 @@ class Recalibrator:
         Raises Refused if there is no record to go back to, BusFault.
         """
         if self._before is None:
-            raise Refused(f"there is no record before {self.record.id} to go back to")
+            raise Refused(f"record {self.record.id} is the first of this arm, and stays current: calibrate again")
         parent, j, joints = self._store.get(self._before), checked.joint, self._written or (checked.joint,)
         assert isinstance(parent, CalibrationRecord)
         recover(self._arm, self._store, self._controllers)

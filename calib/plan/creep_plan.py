@@ -16,7 +16,7 @@ from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.plan.collisions import POINTS, Geometry
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
 from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
-from calib.plan.sweep_options import require_range
+from calib.plan.sweep_options import COLLIDING, require_range
 from calib.plan.sweep_plan import MASS_SHARES
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
@@ -254,7 +254,7 @@ def creep_seconds(plan: SweepPlan) -> float:
 def creep_speed(sweep: Sweep) -> float:
     """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
     if sweep.speed is None:
-        raise BadInput(f"sweep {sweep.name} has no speed, so this is a plan of steps at rest, not of creep sweeps")
+        raise BadInput(f"sweep {sweep.name} has no `speed`: set `sweep.motion: steps` in the arm file, or plan again")
     return sweep.speed
 
 
@@ -301,7 +301,7 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
         pose = random.uniform(*ground.ends)
         if ground.free(pose[None]):
             return np.asarray(pose)
-    raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+    raise BadInput(COLLIDING)
 
 
 def _candidates(

@@ -116,10 +116,7 @@ def _camera(down: Array) -> dict[str, dict[str, float]]:
     up = -down if np.any(down) else np.array([0.0, 0.0, 1.0])
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     eye = 1.8 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
-    return {
-        "up": dict(zip("xyz", up.tolist(), strict=True)),
-        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
-    }
+    return {"up": dict(zip("xyz", up.tolist(), strict=True)), "eye": dict(zip("xyz", eye.tolist(), strict=True))}
 
 
 def _choices(plan: SweepPlan) -> list[dict[str, Any]]:

@@ -112,8 +112,8 @@ VERTICAL = (
     "determined; mount the base tilted by 10° or more and write the tilt as kinematics.gravity"
 )
 NO_LEVER = (
-    "the axes of all joints that gravity loads meet (nearly) in one point, so a mass at an unknown place has no known "
-    "lever, and all torque constants share one unknown factor; measure where the mass hangs (sweep.reference_point)"
+    "the axes of all joints that gravity loads meet (nearly) in one point, so the distance of the mass from them is "
+    "unknown, and all torque constants share one unknown factor; measure where the mass hangs (sweep.reference_point)"
 )
 SHORTEST = 0.005
 """Lever below which the place of the mass hides it [m], root mean square over poses."""

@@ -28,6 +28,12 @@ UNKNOWN = 1e-6
 Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
+COLLIDING = (
+    "almost every pose within the joint ranges collides: correct the collision shapes of the model, or narrow lower "
+    "and upper in the arm file"
+)
+"""Message of a plan without free poses."""
+
 
 def sweep_range(section: SweepSection, limits: DriveLimits, joint: int) -> tuple[float, float]:
     """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
@@ -54,7 +60,7 @@ def scout_poses(
     if geometry is not None:
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
-            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+            raise BadInput(COLLIDING)
     regressor = gravity_regressor(kinematics, poses)
     offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
@@ -74,7 +80,7 @@ def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Ar
     if arm_file.model_path is not None:
         poses = poses[Geometry(arm_file).free(poses)]
         if len(poses) < count:
-            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+            raise BadInput(COLLIDING)
     columns = gravity_regressor(kinematics, poses) @ np.column_stack(payload_columns(kinematics))
     rows = np.concatenate([columns, np.broadcast_to(np.eye(kinematics.n), (*columns.shape[:2], kinematics.n))], axis=2)
     rows = rows / limits.rated[:, None]
@@ -101,9 +107,9 @@ def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(
-                f"joint {name}: range_margin {section.range_margin} rad leaves nothing of its range "
-                f"{limits.lower[joint]} to {limits.upper[joint]} rad to sweep: check lower and upper, or "
-                "reduce range_margin"
+                f"{name}: of its range {limits.lower[joint]:g} to {limits.upper[joint]:g} rad, {last - first:.2f} rad "
+                f"are left to sweep after range_margin ({section.range_margin:g} rad) and 2 % at each end, at least "
+                "0.2 rad are needed: check lower and upper, or reduce range_margin"
             )
 
 
@@ -156,14 +162,15 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
-        needed = " ".join(f"{torque:.1f}" for torque in strongest.min(axis=0))
+        needs = zip(planned.kinematics.names, strongest.min(axis=0), limits.max_torque, strict=True)
+        needed = ", ".join(f"{each} {torque:.1f} of {most:g} N·m" for each, torque, most in needs)
         raise BadInput(
-            f"joint {name} cannot be swept: gravity needs up to {needed} N·m, so in no combination of stops "
-            "can max_torque hold the arm; sweep a lighter arm, or allow more torque"
+            f"{name}: no combination of stops can be held for its sweep: gravity needs at least these shares of "
+            f"max_torque: {needed}: sweep a lighter arm, or raise max_torque"
         )
     note = (
-        f"in sweeps of {name}, max_torque can press the other joints on their stops in too few poses, so in some "
-        "sweeps their position loops hold them"
+        f"{name}: in some of its sweeps the other joints are held by their position loops, since max_torque cannot "
+        "press them on their stops in enough poses"
     )
     return with_lever(everything.kept(pressed | holdable)), [note]
 

@@ -66,10 +66,11 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     every = [each.torque_cycles for each in traits_of(make_groups(arm))]
     _check_readings(link.names, before, link.stats, torque, position, every)
     for joint, name in enumerate(link.names):
-        if np.nanmax(np.abs(torque[:, joint])) > SATURATION_RATIO * limits.rated[joint]:
+        peak, limit = np.nanmax(np.abs(torque[:, joint])), SATURATION_RATIO * limits.rated[joint]
+        if peak > limit:
             raise Refused(
-                f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
-                " unload the joint, or check the sensor"
+                f"{name}: its torque sensor reads up to {peak:.3g} N·m at rest, near the end of its range (limit "
+                f"{limit:.3g} N·m, {SATURATION_RATIO:g} × rated torque): unload the joint, or check the sensor"
             )
         noise = _noise(torque[:, joint])
         if noise > LOUD * limits.rated[joint]:

@@ -138,7 +138,10 @@ def run_verify(
         if progress is not None:
             progress(number, len(held_out))
     if not angles:
-        raise Refused("no pose was reached, since the drives stalled on every way: is the arm free to move?")
+        raise Refused(
+            f"none of {len(held_out)} poses was reached, since a joint stalled on the way to each: check that nothing "
+            "blocks the arm, and max_torque"
+        )
     q = np.array(angles)
     model = gravity_torque(kinematics, beta, q)
     variance = np.diagonal(torque_covariance(kinematics, np.array(gravity.covariance), q), axis1=-2, axis2=-1)

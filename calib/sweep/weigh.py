@@ -17,7 +17,7 @@ from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.fit.payload import Payload, raw_readings, weigh_payload
 from calib.plan.sweep_options import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up
+from calib.sweep.sweep_pass import OnStall, give_up
 from calib.sweep.verify import run_verify
 
 FEWEST = 2

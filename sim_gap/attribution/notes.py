@@ -208,9 +208,9 @@ def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
 
 def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(
-        f"{names[law.joint]}: the remaining {law.channel} is a function of the joint's {law.quantity}"
+        f"{names[law.joint]}: the remaining gap in {law.channel} depends on the joint's {law.quantity}"
         + (", directed against the motion" if law.directed else "")
         + f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); "
-        "its cause is not in the library"
+        "no effect of the library explains it"
         for law in laws
     )

@@ -83,7 +83,7 @@ class Rivals:
         if not confounded:
             return Weighed(max(lost, 0.0), (), None)
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
-        return Weighed(max(lost, 0.0), confounded, f"record {motion}")
+        return Weighed(max(lost, 0.0), confounded, motion)
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""

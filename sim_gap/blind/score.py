@@ -101,10 +101,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
             "within_10_percent": share([error <= 0.1 for error in errors]),
             "inside_ci95": share(inside),
         },
-        "shrink": {
-            "median_ratio": _median(ratios),
-            "at_least_0.95": share([ratio >= 0.95 for ratio in ratios]),
-        },
+        "shrink": {"median_ratio": _median(ratios), "at_least_0.95": share([ratio >= 0.95 for ratio in ratios])},
         "verdicts": dict(Counter(j.verdict for j in judged)),
     }
 

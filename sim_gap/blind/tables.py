@@ -23,7 +23,7 @@ ROWS = (
     ),
     ("parameters: median error", "label_withheld", "parameters", "median_error"),
     ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
-    ("parameters: 95 % intervals that hold", "label_withheld", "parameters", "inside_ci95"),
+    ("parameters: 95 % intervals that contain the true value", "label_withheld", "parameters", "inside_ci95"),
     (
         "decrease of the gap relative to the decrease by the true effect: median",
         "label_withheld",

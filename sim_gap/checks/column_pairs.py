@@ -157,7 +157,7 @@ def require_commands(recordings: Sequence[Recording], label: str, stated: Correc
                 what = f"{column} is followed by q_{other + 1} (correlation {match[other]:.2f}), not by q_{j + 1} "
                 what += f"({match[j]:.2f})"
             elif kind == "sign":
-                remedy = f"give --sign {column}=-1"
+                remedy = f"give --sign {column}=-1 or, if q has the wrong sign, --sign q_{j + 1}=-1"
                 what = f"q_{j + 1} moves in the direction opposite to {column} (correlation {match[j]:.2f})"
             else:
                 unit = f"{column}=deg" if pairs.slope[j] > 1.0 else f"q_{j + 1}=deg"

@@ -64,11 +64,7 @@ def _exceeds(falls: Array, least: float) -> bool:
 
 
 def find_wrong_columns(
-    arm: RigidArm,
-    motion: ChannelMotion,
-    stated: Corrections,
-    follows: Sequence[str],
-    known: Collection[str] = (),
+    arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str], known: Collection[str] = ()
 ) -> RecordingFinding | None:
     """The one thing that is most likely wrong with a torque channel and its motion, if anything certainly is.
 

@@ -32,11 +32,10 @@ class RecordingFinding:
 
     def sentence(self) -> str:
         """For a recording that is diagnosed."""
-        kind = self.finding.replace("_", " ")
         if not self.corrected:
-            return f"{self.evidence_at} ({kind}; diagnosed as recorded; to change this: {self.option})"
+            return f"{self.evidence_at} – diagnosed as recorded; to change this: {self.option}"
         other = f"option: {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
-        return f"{self.evidence_at} ({kind}; this was corrected; {other})"
+        return f"{self.evidence_at} – accounted for; {other}"
 
     def refusal(self) -> str:
         """For a recording that is not diagnosed until this is settled."""

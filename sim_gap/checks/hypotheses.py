@@ -155,7 +155,7 @@ def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Itera
         )
     if not (motion.rubs or stated.effort) and arm.n > 1:
         what = (
-            "the torque contains friction, which a sensor on the link side does not feel, so it is the torque "
+            "the torque contains friction, which a sensor on the link side does not measure, so it is the torque "
             "of the motors"
         )
         yield Hypothesis(

@@ -30,7 +30,7 @@ else, by the first factor, as their velocities jump by the second; anywhere else
 LEAST_BEYOND, LEAST_KICK = 0.005, 0.05
 """Least distance [rad] and velocity [rad/s] of that: a sound recording misses single rows, too (0.002 and 0.002)."""
 TOGETHER = "were separate pieces joined here, or are rows missing?"
-SETTLED = "give each piece as a separate recording, or --clock t=0 if this is right"
+SETTLED = "split the file there and give both parts, or give --clock t=0 to use it as it is"
 
 
 def unwrap(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:

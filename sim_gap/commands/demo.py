@@ -17,8 +17,8 @@ def demo(
         float | None,
         typer.Option(
             min=0,
-            help="Small imperfections of a real arm: 1 for a good arm, 3 for a bad arm; by default the value of "
-            "the arm file.",
+            help="Size of the small imperfections of a real arm: 0 none, 1 a good arm, 3 a bad arm; by default the "
+            "value of the arm file.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path(

@@ -69,10 +69,10 @@ def diagnose(
         ),
     ] = None,
     samples: Annotated[
-        int, _training("Write this number of random draws of all parameters, for domain randomisation.", min=0)
+        int, _training("Write this number of random samples of all parameters, for domain randomisation.", min=0)
     ] = 0,
     out_samples: Annotated[
-        Path | None, _training("File for the draws: .csv, .json or .parquet; by default samples.csv.")
+        Path | None, _training("File for the samples: .csv, .json or .parquet; by default samples.csv.")
     ] = None,
     out_actuators: Annotated[
         Path | None, _training("Write actuator entries for Isaac Lab and mjlab to this file (.py).")
@@ -84,8 +84,8 @@ def diagnose(
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and a module "
-            "beside it for effects that MJCF cannot hold."
+            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and beside it a "
+            "Python module for effects that the format cannot express."
         ),
     ] = None,
 ) -> None:
@@ -196,11 +196,11 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
-        console.print("no draws were written, since there is no gap that parameters could explain", style="yellow")
+        console.print("no samples were written, since there is no gap that parameters could explain", style="yellow")
         return
     else:
         write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
-    console.print(f"{count} draws of all parameters were written to {target}")
+    console.print(f"{count} samples of all parameters were written to {target}")
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:

@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 @reads_recordings
 def diagnose_fleet(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings (with --sim).")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            help="Folder of cases (folders with a model, train* and heldout* recordings); with --sim, of recordings.",
+        ),
+    ],
     stated: "Corrections",
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a dask scheduler; by default workers run on this machine.")

@@ -74,7 +74,7 @@ def collect(
     from sim_gap.experiment import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
-        raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")
+        raise BadInput(f"--out {out}: give a name that ends in .mcap, in a folder that exists")
     require_extra(f"--out {out}", "bags")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)

@@ -65,8 +65,8 @@ DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
 QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 """Ordinary work before the drift begins, at most, and after a recalibration [s]."""
 WATCHED = (
-    "At every stop the observer compares gravity and sensors. Estimates are relative to the calibration in "
-    "force at that time."
+    "At every stop the observer compares gravity and sensors. Estimates are relative to the calibration that "
+    "was current at that time."
 )
 
 

@@ -215,7 +215,11 @@ def load_model(
         raise BadInput(f"{label}: the model has no hinge joint: expected the arm as a chain of hinges")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
-        raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
+        order = ",".join(name for _, name in sorted(zip(joints, arm.names, strict=True)))
+        raise BadInput(
+            f"{label}: the joints of the recording, {', '.join(arm.names)}, are not in the order from base to tip: "
+            f"give --joints {order}"
+        )
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
 

@@ -94,7 +94,7 @@ def test_aliases_that_stand_for_little_are_read(tmp_path):
 
 @pytest.mark.parametrize("device", ["/dev/zero", "/dev/stdin"])
 def test_a_device_is_no_file(device):
-    with pytest.raises(BadInput, match="is not a file"):
+    with pytest.raises(BadInput, match="is a folder or a device"):
         read_whole(Path(device), 100)
 
 

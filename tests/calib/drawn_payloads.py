@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from calib.plan.poses import weighing_poses
 from drawn_arms import drawn_arm
 from realistic_sweeps import RestingArm, both_passes, plans
 
@@ -14,6 +13,7 @@ from calib.arm.sweep_section import sweep_section
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.payload import Payload, raw_readings, weigh_payload
 from calib.fit.sensor_fit import fit_sensors
+from calib.plan.sweep_options import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.weigh import FEWEST
 from sim_bus.sim_section import with_realism

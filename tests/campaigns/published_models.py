@@ -149,7 +149,7 @@ def main() -> int:
         outcomes.append(judge(model, given.seed, given.seconds))
         print(("good " if outcomes[-1].good else "WRONG ") + outcomes[-1].row(), flush=True)
     heading = (
-        "| model | joints | outcome | seconds of a core | gain error | intervals | gravity error |\n"
+        "| model | joints | outcome | CPU time [s] | gain error | intervals | gravity error |\n"
         "|---|---|---|---|---|---|---|"
     )
     table = "\n".join([heading, *(each.row() for each in outcomes)])

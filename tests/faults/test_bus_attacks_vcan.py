@@ -22,7 +22,8 @@ CLOSED = {
     "killed and started again at once": "",
     "its terminal is closed": "the guard was told to end; the joints were told to stop",
     "flood of SYNCs by a program": "80h: is sent more often than 100 times a second",
-    "SYNC as CAN FD by a program": "the program sent 80h as CAN FD, which these drives do not understand",
+    "SYNC as CAN FD by a program": "the program sent 80h as CAN FD, but by the policy (`fd`) this bus carries only "
+    "classical CAN",
 }
 """Attack → what the guard says of it; empty where a killed one says nothing."""
 SAID = {

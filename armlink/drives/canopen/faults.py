@@ -68,8 +68,8 @@ def state_fault(known: JointStates, now: float, modes: Sequence[int], patience: 
             continue
         state = state_of(status)
         if mode != OFF or state in _FAULTS:
-            told = f'is in state "{state.value}" (status word {status:#06x}), expected "operation enabled"'
-            return BusFault(f"{known.names[joint]}: {told}")
+            told = f'state "{state.value}" (status word {status:#06x}), expected "operation enabled"'
+            return BusFault(f"{known.names[joint]}: {told}: read its error code 603Fh")
     return None
 
 

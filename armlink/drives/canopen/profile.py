@@ -14,8 +14,8 @@ from armlink.drives.canopen.units import TORQUE_PER_MICRO
 from armlink.drives.orders import Mode
 
 LOST: Mapping[Entry, str] = {
-    objects.RPDO_DEADLINE: "commands have no deadline: only the heartbeat shows the device that its host is gone",
-    objects.HEARTBEAT_CONSUMER: "the device does not watch its host",
+    objects.RPDO_DEADLINE: "the device does not watch the commands of its host",
+    objects.HEARTBEAT_CONSUMER: "the device does not watch the heartbeat of its host",
     objects.HEARTBEAT_PRODUCER: "only missing readings show that the device has left the bus",
     objects.ABORT_OPTION: "the reaction of the device to a silent host cannot be set",
     objects.QUICK_STOP_OPTION: "whether the device holds after a quick stop cannot be set",

@@ -93,7 +93,8 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
     try:
         return told_units(services, rated_mnm)
     except ValueError as error:
-        raise BusFault(f"{joint.name} (node {settings.node}): the units of the drive cannot be read: {error}") from None
+        where = f"{joint.name} (node {settings.node})"
+        raise BusFault(f"{where}: the scales of its drive are not usable: {error}: set these objects") from None
 
 
 def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSettings) -> Units:

@@ -295,7 +295,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     """By answers to another host that are heard, its commands too; nothing in them tells a model."""
     commanded = {can_id for can_id, data in bus.heard if len(data) == 8}
     heard = {(*data[:1], can_id) for can_id, data in bus.heard if can_id <= 0x7F and len(data) in (6, 8)}
-    note = "its model is not told: write its keys by hand"
+    note = "the drive does not report its model: write its keys by hand"
     return [
         FoundDrive("cubemars", drive, f"id {drive:02X}h", reply=reply, note=note)
         for drive, reply in sorted(heard)

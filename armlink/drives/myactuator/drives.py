@@ -331,13 +331,13 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     for drive in sorted(told):
         named = frames.model_named(told[drive])
         model, rated = named or frames.MOST_TORQUE, frames.RATINGS[named][0] if named else math.nan
-        note = "" if named else f"model {model} assumed: any other makes less than is asked of it; "
+        note = "" if named else f"model {model} assumed: any other model makes less torque than commanded; "
         each = FoundDrive(
             *("myactuator", drive, f"id {drive}", {"id": drive, "model": model}),
             rated_torque=rated,
             max_torque=rated,
             model=told[drive],
-            note=f"{note}its time-out is not told: store one in it (B3h), and state timeout_ms",
+            note=f"{note}the drive does not report its time-out: store one in it (B3h), and state timeout_ms",
             answers=count[drive],
         )
         found.append(each)

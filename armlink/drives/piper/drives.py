@@ -233,7 +233,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     if not wanted <= {can_id for can_id, data in bus.heard if len(data) == 8}:
         return []
     firmware = read_firmware(bus)
-    note = "" if firmware else "its firmware is not told: S-V1.8-2 assumed"
+    note = "" if firmware else "the arm does not report its firmware: S-V1.8-2 assumed"
     keys: Iterator[dict[str, int | str]] = ({"joint": n, "firmware": firmware or "S-V1.8-2"} for n in JOINTS)
     return [
         FoundDrive("piper", number, f"joint {number}", each, model="AgileX Piper", note=note)

@@ -141,7 +141,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         if abs(found - value) > TOLERANCE * abs(value):
             raise BusFault(
                 f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g}, but reads "
-                f"back {found:g}: {otherwise}"
+                f"back {found:g}: {otherwise}; update the firmware, or write it with the maker's tool"
             )
 
     # ---- before the cycle
@@ -169,7 +169,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
             raise self.silent(joint, ", its id is right, and its protocol is private")
         most = min(limits.max_torque, grid.ranges.torque)
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
-        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")
+        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the drive would not limit its torque")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
         otherwise = "the drive would keep on with its last command after its host died"
         self._set(ask, joint, RobStrideParameter.TIMEOUT, deadman, otherwise)
@@ -293,7 +293,9 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
         # a host that has set up a drive since its power-on has set the limit, and with it the deadman
         models = [] if timeout != 0 else [name for name, ranges in RANGES.items() if ranges.torque == limit]
         model = (*models, MOST_TORQUE)[0]
-        why = "has its torque limit as delivered" if models else "any other then makes less than is asked of it"
+        why = "the drive's torque limit is the factory value of this model"
+        if not models:
+            why = "it has the largest torque range, so any other model makes less torque than commanded, never more"
         each = FoundDrive(
             *("robstride", motor, f"motor {motor}", {"id": motor, "model": model, "kp": 0.0, "kd": 0.0}),
             max_torque=RANGES[model].torque,

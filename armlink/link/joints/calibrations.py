@@ -57,13 +57,13 @@ class Calibrations:
         missing = [self.names[joint] for joint in hosted if found[joint] is None]
         if missing and not simulated:
             log.warning(
-                "%s: no calibration record is in force for %s: their torques are used as the drives report them",
+                "%s: there is no current calibration record for %s: their torques are used as the drives report them",
                 self.arm.name,
                 ", ".join(missing),
             )
         if len(missing) < len(hosted) and not self.arm.has_serial:
             log.warning(
-                "%s: its serial is %s, so the calibration in force may belong to another arm of this name: give "
+                "%s: its serial is %s, so the calibration may belong to another arm of this name: give "
                 "each arm a serial of its own (`serial: …`), then calibrate again from the sweeps of each arm",
                 self.arm.name,
                 self.arm.serial,

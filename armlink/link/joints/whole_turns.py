@@ -204,7 +204,8 @@ def positions_before_power(commander: "Commander", set_up: Sequence[float], sinc
         commander.stand([Power.STOPPED if each else Power.OFF for each in powered])
     else:
         names = ", ".join(commander.names[joint] for joint in outdated())
-        raise BusFault(f"{names}: no position was received in {MOST_CYCLES} cycles: no joint gets power")
+        waited = f"no position was received for {MOST_CYCLES * commander.period:.1f} s"
+        raise BusFault(f"{names}: {waited}, so no joint gets power: check power and wiring (`armlink scan`)")
     pairs = zip(loop.seen, loop.latest_position, set_up, strict=True)
     return [latest if seen > since and math.isfinite(latest) else first for seen, latest, first in pairs]
 

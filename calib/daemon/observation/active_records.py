@@ -109,7 +109,7 @@ class ActiveRecords:
     def _store_failed(self, fault: StoreFault) -> None:
         self._looked = self._environment.monotonic() - RECORDS_SECONDS + RETRY_SECONDS
         if not self._store_fault:
-            kept = "" if self.observation is None else "; the records in force stay in force"
+            kept = "" if self.observation is None else "; the current records stay in use"
             self._events.say("fault", None, f"{fault}{kept}", {})
         self._store_fault = str(fault)
 
@@ -134,7 +134,7 @@ class ActiveRecords:
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
             self._events.say(
-                "configuration", None, "other records are now in force, and the observer uses them", evidence
+                "configuration", None, "other records are now current, and the observer uses them", evidence
             )
         self._check_controllers()
 

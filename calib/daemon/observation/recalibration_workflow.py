@@ -80,7 +80,7 @@ class RecalibrationWorkflow:
                 with self._journal.transaction():
                     self._applied(row, proposal.decided_by or "daemon", current)
             else:
-                note = "interrupted before it was in force"
+                note = "interrupted before it became current"
                 self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
         return last
 
@@ -173,7 +173,7 @@ class RecalibrationWorkflow:
         if self._jobs.busy or self._approved:
             raise NotPossible("another recalibration is under way: try again in a moment")
         if base != current:
-            raise NotPossible(f"proposal {number} follows from record {base}, but record {current} is in force now")
+            raise NotPossible(f"proposal {number} follows from record {base}, but record {current} is current now")
 
         def approved() -> None:
             self._approved.append((row, by))
@@ -206,7 +206,7 @@ class RecalibrationWorkflow:
         recalibrator, joint = self._active(), self._names.index(row.proposal.joint)
         current = recalibrator.record.id
         if row.proposal.base != current:
-            self._keep_failure(row, Refused(f"record {current} came into force before it was written"))
+            self._keep_failure(row, Refused(f"record {current} became current before it was written"))
             return
 
         def work() -> CalibrationRecord:
@@ -269,7 +269,7 @@ class RecalibrationWorkflow:
         joint, values, number = row.proposal.joint, record.joints[row.finding.joint], row.proposal.id
         self._checking = (joint,)
         gain = "as before" if values.gain is None else f"{values.gain:.5f}"
-        text = f"{joint}: record {record.id} is in force: gain {gain}, offset {values.offset or 0.0:.3f} N·m"
+        text = f"{joint}: record {record.id} is current: gain {gain}, offset {values.offset or 0.0:.3f} N·m"
         evidence = {"proposal": number, "record": record.id, "replaces": row.proposal.base, "by": by, "applied": True}
         self._decided(row, "applied", by)
         self._events.say("recalibration", joint, text, evidence)
@@ -374,7 +374,9 @@ class RecalibrationWorkflow:
 
     def _active(self) -> Recalibrator:
         if self._recalibrator is None:
-            raise NotPossible("no calibration and gravity records are in force yet: the status says what is missing")
+            raise NotPossible(
+                "there are no current calibration and gravity records yet: the status says what is missing"
+            )
         return self._recalibrator
 
     def _named(self, number: int, digest: str | None = None) -> ProposalRow:

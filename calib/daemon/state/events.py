@@ -205,7 +205,7 @@ def _load(cause: str, evidence: dict[str, Any]) -> str:
         else "the load stays, so it counts as a tool and is part of the model from now on"
     )
     if mass is None:
-        return f"payload of unknown mass, since the levers between the axes do not show its mass; {held}"
+        return f"payload of unknown mass, since the distances between the axes do not show its mass; {held}"
     if mass < 0:
         return f"{-mass:.3f} kg were removed at ({place}) m in the frame of the last link"
     return f"payload of {mass:.3f} kg at ({place}) m in the frame of the last link; {held}"

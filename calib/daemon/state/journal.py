@@ -358,7 +358,7 @@ class Journal:
     def _committed_or_not(self, outcome: tuple[int, sqlite3.Error | None] | Exception) -> None:
         if isinstance(outcome, sqlite3.IntegrityError):
             if self._refused:
-                log.error("journal: %s was not saved: %s", outcome, self._queue.popleft().statements)
+                log.error("journal: a row is left out (%s): %s", outcome, self._queue.popleft().statements)
             self._refused = not self._refused
             self._write_on()
             return

@@ -144,7 +144,8 @@ class RequestGuard:
         if scope["method"] not in SAFE_METHODS:
             origin = headers.get("origin")
             if origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower():
-                raise Denied(403, f"a page of {origin[:100]!r} may not decide anything on this daemon")
+                told = f"the Origin {origin[:100]!r} is not this daemon's Host"
+                raise Denied(403, f"{told}: open the daemon's own page, or let the proxy pass the Host header on")
         if peer.tcp and scope["path"] not in self.access.open_paths:
             self._check_token(headers.get("authorization", ""), peer)
             if peer.connection is not None:

@@ -29,9 +29,9 @@ JOINT = (
     ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
-    ("gain", "sensor_gain_ratio", "Gain relative to the record in force; 1 is no change."),
+    ("gain", "sensor_gain_ratio", "Gain relative to the current record; 1 is no change."),
     ("gain_std", "sensor_gain_std_ratio", "Standard deviation of the gain."),
-    ("offset", "sensor_offset_newton_metres", "Offset relative to the record in force; 0 is no change."),
+    ("offset", "sensor_offset_newton_metres", "Offset relative to the current record; 0 is no change."),
     ("offset_std", "sensor_offset_std_newton_metres", "Standard deviation of the offset."),
     ("samples", "sensor_rests", "Number of rests of the arm used for the estimate."),
 )

@@ -90,7 +90,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
     ) -> Response:
         """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
         if not streams.make_room(owner):
-            raise TooMany(f"{streams.clients} clients are already on the stream")
+            raise TooMany(f"{streams.clients} clients are already on the stream: close one, or try again later")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, tags=["now"])
@@ -104,7 +104,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
 def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     @router.get("/api/status", tags=["now"])
     async def status() -> Status:
-        """State of daemon and bus, records in force."""
+        """State of daemon and bus, current records."""
         return view.status()
 
     @router.get("/api/joints", tags=["now"])

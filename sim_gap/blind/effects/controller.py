@@ -49,11 +49,7 @@ def stiffness(scene: Scene) -> Array:
 
 servo = partial(SizedDraw, make=on_servos)
 SIZED = (
-    servo(
-        "controller.stiffness",
-        "kp",
-        lambda s, r: stiffness(s) * np.exp(sign(r) * r.uniform(0.25, 0.6)),
-    ),
+    servo("controller.stiffness", "kp", lambda s, r: stiffness(s) * np.exp(sign(r) * r.uniform(0.25, 0.6))),
     servo("controller.slew", "limit", lambda s, r: np.quantile(np.abs(s.motion[1]), r.uniform(0.8, 0.95), axis=0)),
     servo(
         "controller.dead_zone",

@@ -5,11 +5,12 @@ import pytest
 from armlink.cli import run
 
 
-@pytest.mark.parametrize("name", ["run.csv", "run", "run.MCAP"])
-def test_another_format_is_converted_to_afterwards(name, tmp_path, capsys):
+@pytest.mark.parametrize(("name", "converted"), [("run.csv", True), ("run", False), ("run.MCAP", False)])
+def test_another_format_is_converted_to_afterwards(name, converted, tmp_path, capsys):
     assert run(["record", "sarcos", str(tmp_path / name), "--bus", "virtual:test-record", "--seconds", "0.01"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "record writes .mcap files: record " in line
+    assert f"record writes .mcap files: give {tmp_path / 'run.mcap'}" in line
+    assert ("armlink convert" in line) is converted
     assert not list(tmp_path.iterdir())
 
 

@@ -77,7 +77,10 @@ def test_it_follows_a_ramp_holds_and_obeys_no_torque(sim: SimulatedArm) -> None:
 
 
 def test_a_guard_of_the_bus_refuses_it(sim: SimulatedArm) -> None:
-    with Link(arm_of(), LockStepBus(arm=sim)) as link, pytest.raises(BadInput, match=r"base: under velocity control"):
+    with (
+        Link(arm_of(), LockStepBus(arm=sim)) as link,
+        pytest.raises(BadInput, match=r"base: its drive takes only velocities"),
+    ):
         link.guard_rules()
 
 

@@ -30,7 +30,7 @@ def test_joints_without_a_record_and_records_without_a_serial_are_named(simulate
     if simulated:
         assert said == []
         return
-    assert said[0].startswith("three: no calibration record is in force for a: their torques")
+    assert said[0].startswith("three: there is no current calibration record for a: their torques")
     assert [text.partition(", so the calibration")[0] for text in said[1:]] == (
         ["three: its serial is unknown"] if serial == "unknown" else []
     )

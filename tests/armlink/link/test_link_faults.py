@@ -59,7 +59,7 @@ def test_a_drive_fault_is_named(enabled, bus):
     bus.out.append((0x381, struct.pack("<Hb", FAULT, 8)))
     assert (
         cycles_until_fault(enabled)[1]
-        == 'joint_1: is in state "fault" (status word 0x0008), expected "operation enabled"'
+        == 'joint_1: state "fault" (status word 0x0008), expected "operation enabled": read its error code 603Fh'
     )
 
 

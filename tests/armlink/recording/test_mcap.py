@@ -147,7 +147,7 @@ def test_a_recorder_that_is_killed_loses_at_most_the_last_second(tmp_path):
         writer.append(recording.t[row], {"position": recording.position[row], "torque": recording.torque[row]})
     loaded = load_recording(tmp_path / "r.mcap")  # never closed
     assert recording.t[-1] - loaded.t[-1] < 1.0
-    assert "cut recording" in loaded.warning
+    assert "truncated recording" in loaded.warning
 
 
 def test_a_bag_without_joint_states_is_one_line(tmp_path):

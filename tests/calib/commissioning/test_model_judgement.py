@@ -172,7 +172,7 @@ def test_a_link_without_mass_is_mentioned(tmp_path: Path) -> None:
     model.write_text(text[:begin] + text[end:])
     made = drafted(model)
     warnings = [found.what for found in model_findings(made.parsed()) if found.level == "warning"]
-    assert "the model gives no mass to what turns with joint_1" in warnings
+    assert "the links moved by joint_1 have no mass in the model" in warnings
 
 
 def test_every_command_refuses_in_the_words_of_doctor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,7 +226,7 @@ def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None
     daemon.run(10)
     (event,) = daemon.of_kind("fault")
     (aside,) = journal.parent.glob("journal.db.damaged-*")
-    assert event.text == f"the journal was damaged: it was moved to {aside.name}, and a new journal was begun"
+    assert event.text == f"the journal was damaged: it was moved to {aside.name}, and a new, empty journal was begun"
     assert daemon.view.status().detail == ""
     assert daemon.view.status().state is State.OBSERVING
 

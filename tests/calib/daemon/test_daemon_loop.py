@@ -316,4 +316,4 @@ def test_the_bus_process_logs_as_the_daemon_does(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-c", program, f"udp_multicast:239.74.171.{os.getpid() % 200 + 1}"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stderr.splitlines()
-    assert any("no calibration record is in force" in json.loads(line)["message"] for line in said)
+    assert any("there is no current calibration record" in json.loads(line)["message"] for line in said)

@@ -162,7 +162,7 @@ def test_an_approval_is_not_written_once_another_record_is_in_force(tmp_path: Pa
     daemon.disk.release()
     assert answer.result(0).state in ("approved", "failed")
     assert daemon.view.proposals()[0].state == "failed"
-    assert "came into force" in daemon.view.proposals()[0].note
+    assert "became current" in daemon.view.proposals()[0].note
     assert [each for each in daemon.sdo if each.startswith("write")] == []
 
 

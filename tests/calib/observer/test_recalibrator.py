@@ -101,7 +101,7 @@ def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
     assert outcome.undo is not None
     old = TorqueCalibration(1.1 * 1.03, -0.4 + 1.1 * 0.3).compose(outcome.undo.change)
     np.testing.assert_allclose((old.gain, old.offset), (1.1, -0.4), atol=1e-6)
-    with pytest.raises(Refused, match="no record before"):
+    with pytest.raises(Refused, match="is the first of this arm"):
         recalibrator.undo(Checked("worse", 1, "again"))
 
 

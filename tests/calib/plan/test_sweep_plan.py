@@ -84,7 +84,7 @@ def test_joints_are_servo_held_where_the_bias_allowed_cannot_press_them() -> Non
     arm = with_section(random_arm(4, 4), bias_torque=(0.5, 0.5, 0.5, 0.5))
     plan = scouted_plan(arm, Truth.draw(arm, 4))
     assert any(any(sweep.servo) for sweep in plan.sweeps)
-    assert any("their position loops hold them" in note for note in plan.notes)
+    assert any("held by their position loops" in note for note in plan.notes)
     assert all(abs(torque) <= 0.5 for sweep in plan.sweeps for torque in sweep.bias or ())
 
 
@@ -120,7 +120,7 @@ def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
 
 
 def test_a_range_too_short_to_sweep_names_the_joint() -> None:
-    with pytest.raises(BadInput, match=r"joint j1: range_margin 1\.5 rad leaves nothing of its range"):
+    with pytest.raises(BadInput, match=r"j1: of its range .* are left to sweep after range_margin \(1\.5 rad\)"):
         plan_sweep(with_section(random_arm(7, 3), range_margin=1.5))
 
 

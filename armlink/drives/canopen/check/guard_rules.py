@@ -48,7 +48,8 @@ def guard_rules(
         unit, profile = read_units(each, row), device.examined(each, row.settings)
         if profile.by_velocity:
             raise BadInput(
-                f"{row.name}: under velocity control (mode 9) no frame shows the guard where the motion will end"
+                f"{row.name}: its drive takes only velocities (mode 9), from which a guard cannot tell where the joint "
+                "will stop: a guard needs drives with cyclic position (8) or torque (10) mode"
             )
         check_fits(row, limit, unit)
         sheet = list(each.remote.object_dictionary)

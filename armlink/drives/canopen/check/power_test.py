@@ -109,7 +109,8 @@ class PowerTest:
         moved = np.abs(sample.position - self._standing)
         if (moved > HELD).any():
             joint = int(np.nanargmax(moved))
-            raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended")
+            text = f"moved by {moved[joint]:.3f} rad while it should hold (limit {HELD:g} rad), so the test was ended"
+            raise BusFault(f"{names[joint]}: {text}: check its load, its brake and its position loop")
         if tested is not None:
             for joint, code, _ in self.drives.known.emergencies:
                 if joint != tested:

@@ -150,15 +150,12 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupF
                 f"the rated torque of the drive (6076h) is {drive.rated_torque:g} N·m, but the arm file has "
                 f"{joint.rated_torque:g}"
             )
-            yield SetupFinding(
-                "error",
-                what,
-                where,
-                f"write `rated_torque: {drive.rated_torque:g}` in the arm file, or connect the right drive",
-            )
+            remedy = f"write `rated_torque: {drive.rated_torque:g}` in the arm file, or connect the right drive"
+            yield SetupFinding("error", what, where, remedy)
         if drive.max_torque < joint.max_torque * (1 - RATED_TORQUE_TOLERANCE):
             what = f"the drive allows {drive.max_torque:g} N·m (6072h), but max_torque is {joint.max_torque:g} N·m"
-            yield SetupFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
+            remedy = f"lower max_torque to {drive.max_torque:g} in the arm file, or raise the drive's own limit (6072h)"
+            yield SetupFinding("warning", what, where, remedy)
     if spare and len(drives.found) - len(spare) == len(link.joints):
         what = f"nodes {', '.join(map(str, spare))} answer but belong to no joint"
         yield SetupFinding("hint", what, bus, "they may be a gripper or another arm: nothing is sent to them")
@@ -215,7 +212,7 @@ def scan_report(
     write(json, {"bus": channel, "nodes": [_answer(each, wrong.get(each.node, [])) for each in found]})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
     if missing:
-        raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
+        raise BusFault(f"no answer from {', '.join(missing)} on {channel}: check power, wiring and ids")
     _require_own_ids(found, channel)
     if wrong:
         node, differs = next(iter(wrong.items()))

@@ -84,7 +84,7 @@ def test_a_stock_device_passes_the_check_and_what_it_lacks_is_told(written, caps
     (node,) = json.loads(scanned.out)["nodes"]
     assert set(node["lost"]) == absent
     assert node["name"] == ("EPOS4" if device == "epos4" else "armlink joint")
-    assert "hinge lacks 1400h:05 RPDO1 event timer: commands have no deadline" in scanned.err
+    assert "hinge lacks 1400h:05 RPDO1 event timer: the device does not watch the commands of its host" in scanned.err
 
 
 def test_the_sample_of_cia_passes_without_power_and_is_not_driven(written, capsys):

@@ -209,7 +209,10 @@ def test_there_is_an_end_to_the_number_of_clients(server: Served, view: MadeUpVi
         found = items(answer)
         first(found, "joints")
         refused = server.client().get("/api/stream")
-        assert (refused.status_code, refused.json()["error"]) == (429, "1 clients are already on the stream")
+        assert (refused.status_code, refused.json()["error"]) == (
+            429,
+            "1 clients are already on the stream: close one, or try again later",
+        )
 
 
 def test_a_stream_that_is_asked_for_while_the_server_ends_ends_at_once() -> None:
