@@ -24,7 +24,7 @@ from sim_bus.node.devices import device_of, power_on_values
 from sim_bus.node.drives import APPLIED, SimulatedDrives
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import Key, ObjectArrays
-from sim_bus.node.pdo import Frame, Pdo, PdoTable
+from sim_bus.node.pdo import Frame, MappedPdo, PdoTable
 from sim_bus.node.supervision import RESET_NODE, Supervision
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
@@ -320,7 +320,7 @@ class SimulatedArm:
             raise BadInput(f"there is no joint {joint!r}; there are {', '.join(self.names)}")
         return self.names.index(joint)
 
-    def _receive_pdo(self, pdo: Pdo, data: bytes) -> None:
+    def _receive_pdo(self, pdo: MappedPdo, data: bytes) -> None:
         size = pdo.packed.itemsize
         if not self._operational[pdo.node]:
             return
@@ -345,7 +345,7 @@ class SimulatedArm:
         self._synchronous = True
         self.supervision.sync(self.time)
 
-    def _take(self, pdos: Sequence[Pdo]) -> None:
+    def _take(self, pdos: Sequence[MappedPdo]) -> None:
         taken = [pdo for pdo in pdos if pdo.take()]
         if taken:
             self.drives.take_commands()

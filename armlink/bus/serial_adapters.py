@@ -87,7 +87,7 @@ class DamiaoSerialBus(SerialAdapterBus):
     incoming = struct.Struct("<BBBI8sB")
     """Head, what happened, length with flags, identifier, data, tail."""
     received = 0x11
-    """What happened: a frame came; others are errors of the bus, and echoes of what was sent (12h)."""
+    """Code of a frame that came; others are errors of the bus, and echoes of what was sent (12h)."""
     sent = 0x12
 
     @staticmethod

@@ -65,7 +65,7 @@ class MitFeedback(NamedTuple):
     torque: float
 
 
-class Field:
+class PackedField:
     """One packed number: of b bits, 2^b − 1 steps from its lowest to its highest value."""
 
     __slots__ = ("least", "most", "span")
@@ -93,8 +93,12 @@ class Grid:
         """`bits` of position, velocity, kp, kd and torque."""
         self.ranges = ranges
         q, v, t, kp, kd = ranges
-        self.position, self.velocity = Field(-q, q, bits[0]), Field(-v, v, bits[1])
-        self.kp, self.kd, self.torque = Field(0.0, kp, bits[2]), Field(0.0, kd, bits[3]), Field(-t, t, bits[4])
+        self.position, self.velocity = PackedField(-q, q, bits[0]), PackedField(-v, v, bits[1])
+        self.kp, self.kd, self.torque = (
+            PackedField(0.0, kp, bits[2]),
+            PackedField(0.0, kd, bits[3]),
+            PackedField(-t, t, bits[4]),
+        )
 
     def steps(self, command: MitCommand) -> tuple[int, int, int, int, int]:
         """Of a command's values; raises ValueError."""

@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError
 from armlink.drives.canopen.pdo import INVALID
 from sim_bus.node.devices import Device
 from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, data_sheet, variable
-from sim_bus.node.pdo import Frame, Pdo, layout
+from sim_bus.node.pdo import Frame, MappedPdo, layout
 from sim_bus.node.torque_sensor_record import WRONG_VALUE, TorqueRecord
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
@@ -155,7 +155,7 @@ class Node:
 
     # ---- PDO objects
 
-    def pdos(self, receive: bool) -> list[Pdo]:
+    def pdos(self, receive: bool) -> list[MappedPdo]:
         """The node's valid RPDOs or TPDOs by its objects."""
         found = []
         for number in range(4):
@@ -166,7 +166,7 @@ class Node:
             cob_id, kind = self.value(communication, 1), self.value(communication, 2)
             if entries and not cob_id & INVALID:
                 cob_id = self.tag | cob_id & ~0x40000000
-                found.append(Pdo(self.place, number, cob_id, kind, entries, self._signals))
+                found.append(MappedPdo(self.place, number, cob_id, kind, entries, self._signals))
         return found
 
     def _check_pdo(self, key: Key, data: bytes) -> None:

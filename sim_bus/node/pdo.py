@@ -21,7 +21,7 @@ def layout(mapping: tuple[int, ...]) -> np.dtype[np.void]:
     return np.dtype(fields)
 
 
-class Pdo:
+class MappedPdo:
     """One valid PDO of one node."""
 
     def __init__(
@@ -58,7 +58,7 @@ class PdoTable:
         self._operational, self._outbox = operational, outbox
         self.compile((), ())
 
-    def compile(self, receive: Iterable[Pdo], send: Iterable[Pdo]) -> None:
+    def compile(self, receive: Iterable[MappedPdo], send: Iterable[MappedPdo]) -> None:
         """Rebuild the table from all valid PDOs of all nodes."""
         receive, send = (sorted(each, key=lambda pdo: (pdo.number, pdo.node)) for each in (receive, send))
         self.receive = {pdo.cob_id: pdo for pdo in receive}
