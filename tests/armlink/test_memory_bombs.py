@@ -20,7 +20,7 @@ from armlink.model_file import compile_model
 HERE = Path(__file__).parent
 SECONDS = 120.0
 """Time after which a reader counts as hung: they take some seconds in all, on a busy machine too."""
-ONE_LINE = ("BadInput: ", "read: 'cut ")
+ONE_LINE = ("BadInput: ", "read: 'truncated ")
 
 
 def outcomes(bombs: Mapping[str, Any], folder: Path) -> list[tuple[str, str, int]]:

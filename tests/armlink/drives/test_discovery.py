@@ -147,7 +147,7 @@ def test_an_id_given_twice_is_refused(tmp_path, monkeypatch, capsys):
 def test_what_is_asked_of_all_families_commands_no_drive(arm, sent):
     """All requests to a bus on which nothing answers, heard by drives that have power."""
     told = BusDrives(LockStepBus(arm=Bench("six-cubemars").arm)).told
-    assert told == "looked for canopen, cubemars, damiao, moteus, myactuator, odrive, robstride"
+    assert told == "looked for canopen, cubemars, damiao, moteus, myactuator, odrive, piper, robstride"
     assert {0x7FF, 0x601, 0x141, 0x160, 0xFD01 | EXTENDED, 0x8001 | EXTENDED} <= {can_id for can_id, _ in sent}
     disturbed(arm, sent)
 

@@ -100,7 +100,7 @@ def test_a_joint_that_runs_away_under_a_constant_torque_is_stopped(link, simulat
     last = link.n - 1
     command.mode[last], command.torque[last] = 10, 3.0
     with pytest.raises(
-        Refused, match=r"gate: joint_7: turns at -?[\d.]+ rad/s under torque control, the limit is [\d.]+ \("
+        Refused, match=r"gate: joint_7: turns at -?[\d.]+ rad/s under torque control, the limit is [\d.]+ rad/s \("
     ):
         run(link, command, 4.0)
     simulated.advance(1.0)
