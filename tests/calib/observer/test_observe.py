@@ -45,7 +45,7 @@ def test_fits_become_records_of_the_arm_and_records_are_checked_to_be_its_own(mo
     sensors, gravity = object.__new__(SensorFit), object.__new__(GravityFit)
     if not fitted:
         sensors = SimpleNamespace(require=lambda arm: "kept calibration")
-        gravity = SimpleNamespace(require=lambda arm: "kept gravity")
+        gravity = SimpleNamespace(carrying=lambda arm: "kept gravity")
     t = np.arange(3.0)
     run = Recording(t=t, position=np.zeros((3, 1)), torque=5.0 + t[:, None])
     found = api.observe("test", run, gravity, sensors)
