@@ -122,13 +122,14 @@ class RequestGuard:
 
     async def _pass(self, scope: Scope, peer: Peer, receive: Receive, send: Send) -> None:
         headers, send = Headers(scope=scope), _with_headers(send)
+        incoming = IncomingBody(receive, _has_body(headers))
         try:
             self._check(scope, peer, headers)
-            body = await _read_body(Request(scope, receive))
+            body = await _read_body(Request(scope, incoming))
         except Denied as denied:
             if _has_body(headers):
                 denied.headers["connection"] = "close"
-            await _refuse(denied, receive, send)
+            await _refuse(denied, incoming, send)
             return
         await self.app(scope, _replay(body, receive), send)
 
@@ -200,6 +201,18 @@ def _has_body(headers: Headers) -> bool:
     return headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
 
+class IncomingBody:
+    """The `receive` of a request, and whether more of its body may come."""
+
+    def __init__(self, receive: Receive, more: bool) -> None:
+        self._receive, self.more = receive, more
+
+    async def __call__(self) -> Message:
+        message = await self._receive()
+        self.more = message["type"] == "http.request" and message.get("more_body", False)
+        return message
+
+
 async def _read_body(request: Request) -> bytes:
     """The whole body; raises Denied if it is too large or too slow."""
     too_large = Denied(413, f"the body of a request may have at most {BODY_LIMIT} bytes")
@@ -248,17 +261,15 @@ def _with_headers(send: Send) -> Send:
     return with_headers
 
 
-async def _refuse(denied: Denied, receive: Receive, send: Send) -> None:
+async def _refuse(denied: Denied, incoming: IncomingBody, send: Send) -> None:
     """Answer, and discard what the client still sends: a connection that is closed with bytes unread is reset, and the
     client gets an error instead of the answer (RFC 9112, section 9.6)."""
     answer = JSONResponse({"error": str(denied)}, denied.status, denied.headers)
     await send({"type": "http.response.start", "status": denied.status, "headers": answer.raw_headers})
     await send({"type": "http.response.body", "body": answer.body, "more_body": True})
-    left, more = LINGER_BYTES, "connection" in denied.headers
+    left = LINGER_BYTES
     with suppress(TimeoutError):
         async with asyncio.timeout(LINGER_SECONDS):
-            while more and left > 0:
-                message = await receive()
-                left -= len(message.get("body", b""))
-                more = message["type"] == "http.request" and message.get("more_body", False)
+            while incoming.more and left > 0:
+                left -= len((await incoming()).get("body", b""))
     await send({"type": "http.response.body", "body": b""})

@@ -1,5 +1,6 @@
 """No answer is lost because the client was still sending, and a client that never stops is cut within bounds."""
 
+import asyncio
 import logging
 import select
 import socket
@@ -14,6 +15,7 @@ from served_page import TOKEN, Served, served
 from calib.daemon.environment import CLOSING_SECONDS
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import server as server_module
+from calib.daemon.web.connection import PEER, Peer
 from calib.daemon.web.guard import HEAD_LIMIT, LINGER_BYTES, RateLimit
 
 MUCH = 100_000
@@ -193,3 +195,23 @@ def test_the_server_ends_before_a_client_that_stays_has_to(tmp_path: Path) -> No
     for raw in (idle, staying):
         with raw, pytest.raises(BrokenPipeError):
             raw.sendall(b"x")
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_refused_body_that_has_come_whole_is_not_waited_for() -> None:
+    """However much of a request one read of the socket brings."""
+    sent: list[guard_module.Message] = []
+    whole = [{"type": "http.request", "body": b"x" * MUCH, "more_body": False}]
+    headers = [(b"host", b"localhost"), (b"transfer-encoding", b"chunked")]
+    scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
+    scope["state"] = {PEER: Peer("ann", "", tcp=False)}
+
+    async def receive() -> guard_module.Message:
+        return whole.pop() if whole else await asyncio.Event().wait()
+
+    async def send(message: guard_module.Message) -> None:
+        sent.append(message)
+
+    guard = guard_module.RequestGuard(lambda *_: None, guard_module.Access(None, frozenset()))
+    asyncio.run(asyncio.wait_for(guard(scope, receive, send), PATIENCE / 2))
+    assert (sent[0]["status"], sent[-1].get("more_body", False)) == (413, False)
