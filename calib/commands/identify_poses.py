@@ -9,7 +9,8 @@ import numpy as np
 
 from armlink.errors import BadInput
 from calib.arm.stated_model import StatedModel, stated_model
-from calib.fit.pose_fit import SENSOR_GAIN_STD, PoseFit, fit_poses, rms
+from calib.fit.calibration import rms
+from calib.fit.pose_fit import SENSOR_GAIN_STD, PoseFit, fit_poses
 from calib.fit.pose_readings import load_poses
 from gcomp.arrays import Array, Mask
 from gcomp.identify.motor_model import MotorDoubt

@@ -36,6 +36,17 @@ NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
 """Values of position sensors that were not fitted."""
 
 
+def rms(values: Array) -> Array:
+    """RMS of each joint's values (K, n) that are numbers (n,)."""
+    count = np.isfinite(values).sum(axis=0)
+    return np.asarray(np.sqrt(np.nansum(values**2, axis=0) / np.where(count, count, np.nan)))
+
+
+def common_scale_std(covariance: Array, gain: Array) -> float:
+    """Standard deviation of a factor common to gains (G,), as a share, by their covariance (G, G)."""
+    return float(np.sqrt(max(float((covariance / np.outer(gain, gain)).mean()), 0.0)))
+
+
 Kind = Literal[
     "spring",
     "direction",

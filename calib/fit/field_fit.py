@@ -15,7 +15,14 @@ from armlink.errors import BadInput, Refused
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.fit.calibration import LOOSEST_GAIN, NOISE_ROUNDS, VERY_STRONG_EVIDENCE, FittedCalibration
+from calib.fit.calibration import (
+    LOOSEST_GAIN,
+    NOISE_ROUNDS,
+    VERY_STRONG_EVIDENCE,
+    FittedCalibration,
+    common_scale_std,
+    rms,
+)
 from calib.fit.creep_residuals import inflation
 from calib.fit.heldout import held_out
 from calib.fit.small_troubles import PositionField
@@ -126,11 +133,9 @@ class FieldProblem:
         target = self.rows.torque[self.rows.counted] * weight
         return linear_posterior(columns * weight[:, None], target, mean, std)
 
-    def table(self, values: Array) -> Array:
-        """Values of the counted readings (P,) as a table (K, n), NaN elsewhere."""
-        whole = np.full(self.rows.torque.shape, np.nan)
-        whole[self.rows.counted] = values
-        return whole
+    def residual(self, columns: Array, x: Array) -> Array:
+        """Readings minus those of parameters x (K, n) [N·m]; NaN for readings that do not count."""
+        return self.rows.table(self.rows.torque[self.rows.counted] - columns @ x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,16 +166,15 @@ class FieldFit(FittedCalibration):
 
     @property
     def residual_rms(self) -> Array:
-        count = np.isfinite(self.residual).sum(axis=0)
-        return np.asarray(np.sqrt(np.nansum(self.residual**2, axis=0) / np.where(count, count, np.nan)))
+        return rms(self.residual)
 
     @property
     def common_scale_std(self) -> float:
         """Standard deviation of a factor common to all gains; it comes from the gravity record alone."""
         gain = self.value("gain")
         known = np.flatnonzero(np.isfinite(gain))
-        relative = self.solution.covariance[np.ix_(known, known)] / np.outer(gain[known], gain[known])
-        return float(np.sqrt(relative.mean())) if len(known) else float("nan")
+        own = self.solution.covariance[np.ix_(known, known)]
+        return common_scale_std(own, gain[known]) if len(known) else float("nan")
 
     def record(self, arm_file: ArmFile, before: CalibrationRecord | None = None) -> CalibrationRecord:
         """With what was not found as in `before`, the current one. Raises Refused if no value was identified."""
@@ -201,7 +205,7 @@ def fit_field(
     for _ in range(NOISE_ROUNDS):
         columns = problem.columns(gain)
         solved = problem.solve(columns, noise, np.ones(n))
-        residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
+        residual = problem.residual(columns, solved.x)
         gain, noise = solved.x[:n], rows.sigma * np.maximum(scatter_factor(residual, rows), 1.0)
     unseen = np.sqrt(np.diag(solved.covariance)[:n]) > LOOSEST_GAIN * np.abs(gain)
     if unseen.any():
@@ -262,8 +266,7 @@ def _report(
                 f"it cannot be separated from the gain: known to ± {2 * offset_std[j]:.2g} N·m only, as"
                 f" torque stays between {here.min():.2f} and {here.max():.2f} N·m"
             )
-    residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
-    return FieldFit(names, solved, hysteresis, reasons, residual, model, sources)
+    return FieldFit(names, solved, hysteresis, reasons, problem.residual(columns, solved.x), model, sources)
 
 
 def _no_gain(torque: Array) -> str:

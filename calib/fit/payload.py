@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.fit.calibration import NOISE_ROUNDS
+from calib.fit.calibration import NOISE_ROUNDS, common_scale_std, rms
 from calib.fit.creep_fit import SEEN
 from calib.fit.field_fit import UNKNOWN_MOMENT, FieldProblem, scatter_factor
-from calib.fit.pose_fit import rms
 from calib.fit.slow_windows import directions
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array, Mask
@@ -75,24 +74,23 @@ def weigh_payload(
     noise = readings.sigma
     for _ in range(NOISE_ROUNDS):
         solved = problem.solve(columns, noise, more=[UNKNOWN_MOMENT] * 4)
-        left = problem.table(readings.torque[readings.counted] - columns @ solved.x)
+        left = problem.residual(columns, solved.x)
         noise = readings.sigma * np.maximum(scatter_factor(left, readings), 1.0)
     value = solved.x[-4:]
-    of_scale = common_scale_std(calibration) * value
+    of_scale = _gain_scale_std(calibration) * value
     return Payload(
         value, solved.covariance[-4:, -4:] + np.outer(of_scale, of_scale), rms(left) / np.abs(problem.installed.gain)
     )
 
 
-def common_scale_std(calibration: CalibrationRecord) -> float:
+def _gain_scale_std(calibration: CalibrationRecord) -> float:
     """Standard deviation of a factor common to all gains, as a share: their errors stem from one reference mass."""
     gain = {f"{joint.name}.gain": joint.gain for joint in calibration.joints if joint.gain is not None}
     places = [place for place, name in enumerate(calibration.covariance_of) if name in gain]
     if not places:
         return 0.0
     known = np.array([gain[calibration.covariance_of[place]] for place in places])
-    relative = np.array(calibration.covariance)[np.ix_(places, places)] / np.outer(known, known)
-    return float(np.sqrt(max(relative.mean(), 0.0)))
+    return common_scale_std(np.array(calibration.covariance)[np.ix_(places, places)], known)
 
 
 def raw_readings(position: Array, torque: Array, sigma: Array, calibration: CalibrationRecord) -> StaticReadings:

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from calib.fit.calibration import NOISE_ROUNDS
+from calib.fit.calibration import NOISE_ROUNDS, rms
 from calib.fit.creep_fit import LEAST_COULOMB, SEEN
 from calib.fit.creep_residuals import LEAST_STD_SHARE, inflation
 from calib.fit.field_fit import BLOCK
@@ -87,14 +87,14 @@ class PoseFit:
     @cached_property
     def gravity(self) -> GravityFit:
         """Mass moments without the reference mass; those that the poses do not determine stay near the model's."""
-        place, residual = family_slices(self.arm.n)["beta"], self.table(self.solution.residual)
+        place = family_slices(self.arm.n)["beta"]
         return GravityFit(
             names=self.arm.names,
             beta=self.x[place],
             covariance=self.covariance[place, place],
             identifiable=self._identifiability[0],
             recursive=None,
-            residual_rms=rms(residual),
+            residual_rms=rms(self.readings.table(self.solution.residual)),
             sources=self.sources,
         )
 
@@ -110,13 +110,9 @@ class PoseFit:
     @cached_property
     def _identifiability(self) -> tuple[Mask, tuple[str, ...]]:
         n, own, sensor = self.arm.n, family_slices(self.arm.n), sensor_slices(self.arm.n)
-        free = np.concatenate([np.arange(*own[name].indices(len(self.x))) for name in ("gain", "beta")])
-        free = free[np.diag(self.covariance)[free] > 0]
+        both = np.stack([np.r_[slices["gain"], slices["beta"]] for slices in (own, sensor)])
+        free, places = both[:, np.diag(self.covariance)[both[0]] > 0]
         names = np.array(parameter_names(self.arm))
-        label = {
-            own[f].start + k: sensor[f].start + k for f, size in (("gain", n), ("beta", 2 * n)) for k in range(size)
-        }
-        places = [label[each] for each in free.tolist()]
         unit = natural_units(self.arm, self.readings, Parameters.nominal(n))[places]
         triangle = np.asarray(np.linalg.cholesky(invert(self.covariance[np.ix_(free, free)])).T, float)
         information = analyse(triangle, unit)
@@ -124,12 +120,6 @@ class PoseFit:
         moments = free >= own["beta"].start
         determined[free[moments] - own["beta"].start] = information.determined[moments]
         return determined, describe_null_space(information.null_basis, tuple(names[places].tolist()))
-
-    def table(self, values: Array) -> Array:
-        """Values of the readings that count (R,) as (K, n); NaN elsewhere."""
-        whole = np.full(self.readings.torque.shape, np.nan)
-        whole[self.readings.counted] = values
-        return whole
 
     def bound(self, q: Array) -> Array:
         """95 % bound of each joint's RMS error of gravity torque over the poses q (K, n) [rad], (n,) [N·m]."""
@@ -152,14 +142,12 @@ class PoseFit:
             block = np.isin(rows, part)
             hat = columns[block] @ self.solution.covariance @ columns[block].T
             error[block] = np.linalg.solve(np.eye(len(hat)) - hat, left[block])
-        return rms(self.table(error / self.white))
+        return rms(self.readings.table(error / self.white))
 
     def errors(self, readings: StaticReadings) -> Array:
         """Readings less their prediction (K, n) [N·m]; NaN for those that do not count."""
         model = MotorModel(self.arm, readings)
-        whole = np.full(readings.torque.shape, np.nan)
-        whole[readings.counted] = model.reading - model.predict(self.x)
-        return whole
+        return readings.table(model.reading - model.predict(self.x))
 
     def with_nominal_moments(self) -> "PoseFit":
         """The fit with the mass moments of the model, all else as free as here."""
@@ -213,7 +201,7 @@ def fit_poses(
     families = ["gain", "offset", "beta", *["rho"] * bool(readings.load.any())]
     families += ["coulomb", "load", "asymmetry", "uneven"] if readings.direction.any() else []
     families += ["viscous", "lag"] if readings.velocity.any() else []
-    free = np.sort(np.concatenate([np.arange(*slices[name].indices(slices["rho"].stop)) for name in families]))
+    free = np.sort(np.r_[tuple(slices[name] for name in families)])
     mean, std = doubt.prior(arm, rated, True, 0.02 * rated)
     mean[slices["beta"]] = nominal
     known = np.where(np.isin(np.arange(len(mean)), free), mean, 0.0)
@@ -248,12 +236,10 @@ def _root_weights(readings: StaticReadings, residual: Array, white: Array, deter
     residuals are worth (Huber's variance of an M-estimate), what neighbours have in common taken into account.
     """
     counted = readings.counted
-    whole = np.zeros(counted.shape)
-    whole[counted] = residual
     variance = _mean(white**-2.0, counted)
     spread = np.sqrt(1 + readings.sigma**2 / np.where(variance > 0, variance, 1.0))
     """Of a reading that is doubted beforehand, over that of the others of its joint."""
-    left = (whole / spread).T
+    left = (np.nan_to_num(readings.table(residual)) / spread).T
     problem = EstimationProblem((), lambda theta: theta, counted.T.astype(float), readings.series, floor)
     variance = scale_of(problem, left)
     weight = robust_weight(left, variance, FREEDOM)
@@ -277,9 +263,3 @@ def _mean(values: Array, counted: Mask) -> Array:
     joint = np.nonzero(counted)[1]
     n = counted.shape[1]
     return np.asarray(np.bincount(joint, values, minlength=n) / np.maximum(np.bincount(joint, minlength=n), 1))
-
-
-def rms(values: Array) -> Array:
-    """RMS of each joint's values (K, n) that are numbers (n,)."""
-    count = np.isfinite(values).sum(axis=0)
-    return np.asarray(np.sqrt(np.nansum(values**2, axis=0) / np.where(count, count, np.nan)))

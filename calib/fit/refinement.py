@@ -206,9 +206,7 @@ def refine(
         raw, freedom = _scatter(linear, kinematics.n)
         factor = np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), LEAST_FACTOR)
     found = analyse(linear.triangle, problem.scale)
-    residual = np.full(readings.torque.shape, np.nan)
     troubled = linear.effects @ (linear.effects.T @ linear.residual)
-    residual[readings.counted] = (linear.residual + troubled) * linear.sigma
     determined, covariance = found.determined[:count], found.covariance[:count, :count]
     deviation = np.zeros(len(vector))
     deviation[problem.free] = np.where(determined, np.sqrt(np.abs(np.diag(covariance))), np.inf)
@@ -220,7 +218,7 @@ def refine(
         covariance=covariance,
         identifiable=determined,
         null_space=describe_null_space(found.null_basis[:count], fit.names),
-        residual=residual,
+        residual=readings.table((linear.residual + troubled) * linear.sigma),
         chi2=float(linear.residual @ linear.residual),
         dof=round(float(freedom.sum())),
     )

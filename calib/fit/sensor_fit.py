@@ -16,7 +16,7 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
-from calib.fit.calibration import FitFinding, FittedCalibration
+from calib.fit.calibration import FitFinding, FittedCalibration, rms
 from calib.fit.examination import Goodness, examine
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, Discrepancy, Parameter
@@ -202,8 +202,7 @@ class SensorFit(FittedCalibration):
 
     @property
     def residual_rms(self) -> Array:
-        rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
-        return rms
+        return rms(self.fit.residual)
 
 
 def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:

@@ -72,6 +72,12 @@ class StaticReadings:
         """Torque readings that count (K, n)."""
         return ~np.isnan(self.torque)
 
+    def table(self, values: Array) -> Array:
+        """Values of the torque readings that count (R,) as (K, n); NaN elsewhere."""
+        whole = np.full(self.torque.shape, np.nan)
+        whole[self.counted] = values
+        return whole
+
     def __len__(self) -> int:
         return len(self.position)
 
