@@ -38,14 +38,14 @@ def gcomp_arm(arm_file: ArmFile) -> Arm:
         raise BadInput(f"{arm_file.path}: kinematics: {error}") from None
 
 
-def model_arm(arm_file: ArmFile) -> ModelArm:
+def model_arm(arm_file: ArmFile, placed: PlacedChain | None = None) -> ModelArm:
     """The arm of the arm file's model file, with the mass moments of the model and the arm file's tool.
 
-    Raises BadInput as gcomp_arm does.
+    `placed` is its chain where that is known already. Raises BadInput as gcomp_arm does.
 
     The arm file's gravity is in the model's world frame; without it the model's own is used.
     """
-    model, kinematics = model_chain(arm_file).arm, arm_file.kinematics
+    model, kinematics = (placed or model_chain(arm_file)).arm, arm_file.kinematics
     if arm_file.link is not None and arm_file.joint_names != model.arm.names:
         raise BadInput(
             f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the chain of the model is "

@@ -53,7 +53,7 @@ def judged_fit(
         gain_std = SENSOR_GAIN_STD if channel == "torque" else MotorDoubt.gain
     link = None if model.arm_file is None else model.arm_file.link
     rated = np.full(model.arm.n, float(np.nanmax(np.abs(readings.torque)))) if link is None else link.rated_torques
-    nominal = np.zeros(2 * model.arm.n) if model.placed is None else model.placed.arm.beta
+    nominal = np.zeros(2 * model.arm.n) if model.beta is None else model.beta
     fit = fit_poses(model.arm, readings, rated, nominal, gain_std, sources)
     plain = fit.with_nominal_moments()
     if not heldout:

@@ -62,20 +62,17 @@ def _model(
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     from armlink.errors import BadInput, Refused
     from calib.arm.stated_model import stated_model
-    from calib.arm.tool import parse_tool, tool_moments, with_tool
     from calib.commands.options import gravity_model
     from calib.records.store import RecordStore, way_to
 
-    stated = stated_model(arm, base, tip)
+    stated = stated_model(arm, base, tip, tool)
     arm_file = stated.arm_file
     if arm_file is None and record is not None:
         raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
-    if stated.placed is not None and (arm_file is None or record is None):
+    if stated.beta is not None and record is None:
         source = arm if arm_file is None or stated.path is None else stated.path.name
-        carried = parse_tool(tool) if tool is not None else None if arm_file is None else arm_file.tool
-        return stated.arm, stated.placed.arm.beta + tool_moments(stated.arm, carried), f"inertials of {source}"
-    assert arm_file is not None  # a model file is placed
-    arm_file = with_tool(arm_file, tool)
+        return stated.arm, stated.beta, f"inertials of {source}"
+    assert arm_file is not None  # a model file has inertials, and none has a record
     found = gravity_model(arm_file, record, RecordStore(store))
     if found is None:
         raise Refused(

@@ -42,8 +42,9 @@ def clear_ranges(arm_file: ArmFile, problem: Exception) -> Iterator[ClearRange]:
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return
-    arm, generator = model_arm(arm_file).arm, np.random.default_rng(0)
-    own = np.clip(model_chain(arm_file).reference, arm.lower, arm.upper)
+    placed, generator = model_chain(arm_file), np.random.default_rng(0)
+    arm = model_arm(arm_file, placed).arm
+    own = np.clip(placed.reference, arm.lower, arm.upper)
     drawn = generator.uniform(arm.lower, arm.upper, (CENTRES, arm.n))
     centres = np.concatenate([[(arm.lower + arm.upper) / 2, own], drawn])
     centres = centres[geometry.free(centres)]

@@ -11,7 +11,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.arm.kinematics import gcomp_arm, model_chain
+from calib.arm.kinematics import gcomp_arm, model_arm, model_chain
 from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
@@ -203,11 +203,12 @@ def drawn_arm(arm_file: ArmFile) -> DrawnArm:
     At joint positions q, link i stands where the rotations by q_j − reference_j about axes j ≤ i bring it, the last
     one first.
     """
-    arm = gcomp_arm(arm_file)  # which also says what is wrong with a model file
     if arm_file.model_path is None:
+        arm = gcomp_arm(arm_file)
         gravity, reference, (axes, links) = arm.gravity, np.zeros(arm.n), _of_rows(arm)
     else:
         placed = model_chain(arm_file)
+        arm = model_arm(arm_file, placed).arm  # which also says what is wrong with a model file
         gravity, reference, (axes, links) = placed.model.opt.gravity, placed.reference, _of_model(placed)
     if len(links[-1]) < 2:  # a last link without length gets a stub of 8 cm
         links[-1] = np.stack([links[-1][0], links[-1][0] + 0.08 * axes[-1]])

@@ -68,7 +68,7 @@ def pose_readings(
         windows = windows_of(t[whole], position[whole], torque[whole], source)
         inertia = np.zeros_like(windows.torque)
         counted = windows.slow
-        if model.placed is not None and model.has_inertials:
+        if model.placed is not None and model.placed.arm.beta.any():
             inertia = inertial_torque(model.placed, windows.position, windows.velocity, windows.acceleration)
             counted = np.ones(len(inertia), dtype=bool)
         found = StaticReadings(

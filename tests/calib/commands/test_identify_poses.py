@@ -11,8 +11,10 @@ from drawn_poses import draw, outcome
 from real_poses import real_poses
 
 from armlink import cli
+from armlink.arm_file import load_arm
 from armlink.recording.files import keeps_names, save_recording
 from armlink.recording.recording import Recording, take_joints
+from calib.arm.kinematics import model_arm
 from calib.arm.stated_model import stated_model
 from calib.commands.identify_poses import judged_fit
 from gcomp.arm.load import inertial_torque
@@ -140,6 +142,17 @@ def test_an_arm_file_gets_a_gravity_record(bench, tmp_path):
     np.savetxt(tmp_path / "poses.csv", values, delimiter=",", header=header, comments="")
     answer = answered(bench, str(tmp_path / "poses.csv"), "--model", "sarcos", "--gain-std", "0")
     assert cli.run(["history", "sarcos", "--store", str(bench / "r.db"), "--record", answer["record"]]) == 0
+
+
+def test_the_models_own_moments_are_those_with_the_tool_of_the_arm_file(bench):
+    tool = "{mass: 1.5, centre: [0.1, 0, 0]}"
+    (bench / "arm.yaml").write_text(f"name: two\nserial: '1'\nkinematics: {{model: arm.xml}}\ntool: {tool}\n")
+    exact = model_arm(load_arm(str(bench / "arm.yaml")))
+    q = np.random.default_rng(8).uniform(-2, 2, (40, 2))
+    table(bench / "carrying.csv", q, gravity_torque(exact.arm, exact.beta, q))
+    judged = judged_fit(stated_model(str(bench / "arm.yaml")), [bench / "carrying.csv"], [], {}, 0.0)
+    assert np.all(judged.nominal < 0.02)
+    assert judged.fit.gravity.beta == pytest.approx(exact.beta, abs=0.01)
 
 
 @pytest.mark.parametrize(
