@@ -33,13 +33,12 @@ def weigh(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results
     from armlink.loop.open import open_arm
-    from calib.arm.tool import with_tool
     from calib.commands.screen import SweepScreen, confirm
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore, no_record
     from calib.sweep.weigh import run_weigh
 
-    arm_file, records = with_tool(load_arm(arm), "0"), RecordStore(store)
+    arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
     gravity, calibration = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
     if gravity is None:
         raise no_record(arm_file, "gravity")

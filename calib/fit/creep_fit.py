@@ -10,7 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.torque_calibration import GAIN_RANGE
-from calib.arm.kinematics import DriveLimits, gcomp_arm
+from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
 from calib.fit.calibration import LOOSEST_GAIN, NOISE_ROUNDS, FitFinding, FittedCalibration
@@ -184,7 +184,7 @@ def fit_creep(arm_file: ArmFile, data: Sequence[SweepData]) -> CreepFit:
     if not rows.readings.velocity.any():
         raise BadInput(f"{data[0].path}: no creep sweeps: sweep with sweep.motion: creep")
     doubt = sweep_section(arm_file).motor_doubt
-    fit = fit_rows(gcomp_arm(arm_file), rows, DriveLimits.of(arm_file).rated, doubt)
+    fit = fit_rows(gcomp_arm(arm_file), rows, arm_file.require_link().rated_torques, doubt)
     contacts = tuple(contact_finding(each, stall) for each in data for stall in each.contacts)
     return replace(fit, pushes=(*contacts, *fit.pushes), sources=digests(data))
 

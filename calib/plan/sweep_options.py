@@ -54,39 +54,50 @@ def scout_poses(
     Poses in which bodies of `geometry` touch are left out; raises BadInput if too few remain.
     """
     n = kinematics.n
-    ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
-    generator = np.random.default_rng(seed)
-    poses = ends[:, 0] + generator.random((300, n)) * (ends[:, 1] - ends[:, 0])
-    if geometry is not None:
-        poses = poses[geometry.free(poses)]
-        if len(poses) < 2 * (n + 3):
-            raise BadInput(COLLIDING)
-    regressor = gravity_regressor(kinematics, poses)
-    offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
-    rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
-    information = np.einsum("kip,kiq->kpq", rows, rows)
-    (chosen,) = select([information[None]], UNKNOWN * np.eye(3 * n)[None], [n + 3], exchanges=0)
-    return tuple(tuple(pose.tolist()) for pose in nearest_first(poses[chosen], ends.mean(axis=1)))
+    poses = _free_poses(section, limits, np.random.default_rng(seed), geometry, 2 * (n + 3))
+    chosen = _telling(poses, gravity_regressor(kinematics, poses), 10.0, limits, n + 3)
+    middle = np.mean([sweep_range(section, limits, joint) for joint in range(n)], axis=1)
+    return tuple(tuple(pose.tolist()) for pose in nearest_first(chosen, middle))
 
 
 def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
     """Poses (P, n) [rad] that tell a payload's mass and place best (D-optimal), in an order with little travel.
 
-    Where the arm file has geometry, poses in which bodies touch are left out.
+    Where the arm file has geometry, poses in which bodies touch are left out; raises BadInput if too few remain.
     """
     kinematics, limits, section = gcomp_arm(arm_file), DriveLimits.of(arm_file), sweep_section(arm_file)
-    ends = np.array([sweep_range(section, limits, joint) for joint in range(kinematics.n)])
-    poses = ends[:, 0] + np.random.default_rng([seed, 8]).random((300, kinematics.n)) * (ends[:, 1] - ends[:, 0])
-    if arm_file.model_path is not None:
-        poses = poses[Geometry(arm_file).free(poses)]
-        if len(poses) < count:
-            raise BadInput(COLLIDING)
+    geometry = None if arm_file.model_path is None else Geometry(arm_file)
+    poses = _free_poses(section, limits, np.random.default_rng([seed, 8]), geometry, count)
     columns = gravity_regressor(kinematics, poses) @ np.column_stack(payload_columns(kinematics))
-    rows = np.concatenate([columns, np.broadcast_to(np.eye(kinematics.n), (*columns.shape[:2], kinematics.n))], axis=2)
-    rows = rows / limits.rated[:, None]
+    return nearest_first(_telling(poses, columns, 1.0, limits, count), begin)
+
+
+def drawn_poses(section: SweepSection, limits: DriveLimits, count: int, random: np.random.Generator) -> Array:
+    """Poses (count, n) [rad] all over the range that sweeps have."""
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
+    return np.asarray(ends[:, 0] + random.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]))
+
+
+def _free_poses(
+    section: SweepSection, limits: DriveLimits, random: np.random.Generator, geometry: Geometry | None, fewest: int
+) -> Array:
+    """Drawn poses (P, n) [rad] in which no bodies of `geometry` touch; raises BadInput if too few remain."""
+    poses = drawn_poses(section, limits, 300, random)
+    if geometry is not None:
+        poses = poses[geometry.free(poses)]
+        if len(poses) < fewest:
+            raise BadInput(COLLIDING)
+    return poses
+
+
+def _telling(poses: Array, columns: Array, offset: float, limits: DriveLimits, count: int) -> Array:
+    """The poses (count, n) that tell most (D-optimal) of unknowns with these columns (P, n, p) of torque and of every
+    joint's offset, in units of `offset` [N·m]."""
+    offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
+    rows = np.concatenate([columns, offsets], axis=2) / limits.rated[:, None]
     information = np.einsum("kip,kiq->kpq", rows, rows)
     (chosen,) = select([information[None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
-    return nearest_first(poses[chosen], begin)
+    return poses[chosen]
 
 
 def nearest_first(poses: Array, begin: Array) -> Array:

@@ -22,7 +22,7 @@ from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.creep_plan import CreepGround
-from calib.plan.sweep_options import nearest_first, sweep_range
+from calib.plan.sweep_options import drawn_poses, nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
@@ -119,13 +119,12 @@ def run_verify(
     beta = np.array(gravity.beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
-    read_at: ReadAt
-    if creeping:
-        read_at, held_out = _half_sum_at, _creep_poses(CreepGround.of(arm_file), poses, seed, mover.position)
-    else:
-        read_at, held_out = _rest_at, verify_poses(limits, section, poses, seed, mover.position)
-    if at is not None:
-        held_out = at(mover.position)
+    read_at: ReadAt = _half_sum_at if creeping else _rest_at
+    if at is None and creeping:
+        at = partial(_creep_poses, CreepGround.of(arm_file), poses, seed)
+    elif at is None:
+        at = partial(verify_poses, limits, section, poses, seed)
+    held_out = at(mover.position)
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
@@ -195,9 +194,7 @@ def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
 
 def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
     """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
-    ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
-    generator = np.random.default_rng([seed, 6])
-    return nearest_first(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
+    return nearest_first(drawn_poses(section, limits, count, np.random.default_rng([seed, 6])), begin)
 
 
 def _creep_poses(ground: CreepGround, count: int, seed: int, begin: Array) -> Array:

@@ -12,7 +12,6 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.loop.driver import ArmDriver
-from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.fit.payload import Payload, raw_readings, weigh_payload
 from calib.plan.sweep_options import weighing_poses
@@ -54,7 +53,7 @@ def run_weigh(
     reached = len(found.sensor)
     if reached < FEWEST:
         raise Refused(f"{reached} of {poses} poses were reached: can the drives hold the load?")
-    sigma = sweep_section(arm_file).standard_error * DriveLimits.of(arm_file).rated
+    sigma = sweep_section(arm_file).standard_error * arm_file.require_link().rated_torques
     readings = raw_readings(found.position, found.sensor, np.maximum(sigma, 1e-9), calibration)
     if creeping:  # half sums of both directions
         readings = replace(readings, direction=np.zeros_like(readings.direction))
