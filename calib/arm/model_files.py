@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.content.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole, writing
 from armlink.content.yaml_text import yaml_document
-from armlink.errors import BadInput
 from calib.arm.urdf import URDF, urdf_of
 from gcomp.arm.arm import Arm
 from gcomp.arm.consistent_bodies import with_moments
@@ -32,7 +31,8 @@ def write_model(placed: PlacedChain, source: Path, beta: Array, path: Path) -> N
         text = urdf_of(compiled, source if source.suffix.lower() == URDF else None)[0]
     else:
         text = spec.to_xml()
-    _write(path, text)
+    with writing(path):
+        write_whole(path, text)
 
 
 def write_coefficients(arm: Arm, beta: Array, std: Array, path: Path) -> None:
@@ -53,11 +53,5 @@ def write_coefficients(arm: Arm, beta: Array, std: Array, path: Path) -> None:
             "standard_deviations": std[acting].tolist(),
         },
     }
-    _write(path, yaml_document({"/**": {"ros__parameters": {"gravity_model": parameters}}}))
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        write_whole(path, text)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    with writing(path):
+        write_whole(path, yaml_document({"/**": {"ros__parameters": {"gravity_model": parameters}}}))

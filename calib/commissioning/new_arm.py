@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
-from armlink.content.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole, writing
 from armlink.content.file_content import parse_yaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
@@ -55,11 +55,9 @@ class NewArm:
 
     def write(self) -> None:
         """Write the file; raises BadInput."""
-        try:
+        with writing(self.out):
             self.out.parent.mkdir(parents=True, exist_ok=True)
             write_whole(self.out, self.text)
-        except OSError as error:
-            raise BadInput(f"{self.out}: cannot be written: {error.strerror}") from None
 
 
 def new_arm(
