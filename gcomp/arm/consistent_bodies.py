@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arm.arm import Arm
-from gcomp.arm.inertials import body_parameters, set_body
+from gcomp.arm.inertials import body_parameters, inertial_of_pseudo, pseudo_inertia, set_body
 from gcomp.arm.load import PlacedChain
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
@@ -34,12 +34,12 @@ def with_moments(placed: PlacedChain, beta: Array) -> Any:
     heaviest = [max(bodies, key=lambda body: float(model.body_mass[body])) for bodies in placed.bodies]
     own = np.array([_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)])
     rest = placed.arm.beta - base_parameters(arm, own[:, 0], own[:, 1:4])
-    found = closest_bodies(arm, np.array([_pseudo(each) for each in own]), beta - rest)
+    found = closest_bodies(arm, np.array([pseudo_inertia(each) for each in own]), beta - rest)
     for link, body in enumerate(heaviest):
         turn, origin = _body_in_bar_frame(placed, link, body)
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = turn.T, -turn.T @ origin
-        set_body(model, body, np.zeros(3), _ten(matrix @ found[link] @ matrix.T))
+        set_body(model, body, np.zeros(3), inertial_of_pseudo(matrix @ found[link] @ matrix.T))
     return model
 
 
@@ -126,18 +126,3 @@ def _in_bar_frame(placed: PlacedChain, link: int, body: int) -> Array:
     """Ten inertial parameters of a body in its link's bar frame."""
     turn, origin = _body_in_bar_frame(placed, link, body)
     return body_parameters(placed.model, body, -turn.T @ origin, turn)
-
-
-def _pseudo(ten: Array) -> Array:
-    """Pseudo-inertia matrix (4, 4) of ten parameters."""
-    inertia, out = ten[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], np.empty((4, 4))
-    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    out[:3, 3] = out[3, :3] = ten[1:4]
-    out[3, 3] = ten[0]
-    return out
-
-
-def _ten(pseudo: Array) -> Array:
-    """Ten parameters of a pseudo-inertia matrix (4, 4)."""
-    inertia = np.trace(pseudo[:3, :3]) * np.eye(3) - pseudo[:3, :3]
-    return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])

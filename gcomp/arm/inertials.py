@@ -9,14 +9,36 @@ import numpy as np
 
 from gcomp.arrays import Array
 
+SIX = np.triu_indices(3)
+"""Entries of a symmetric matrix in that order: xx, xy, xz, yy, yz, zz."""
 LEAST_SECOND_MOMENT = 1e-6
 """Least second moment of mass along a principal axis [kg·m²]."""
+
+
+def symmetric(six: Array) -> Array:
+    """Six entries (…, 6) as symmetric matrices (…, 3, 3)."""
+    return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+
+
+def pseudo_inertia(inertial: Array) -> Array:
+    """The pseudo-inertia matrix (4, 4) of ten parameters: positive definite for every body that can exist (Wensing)."""
+    inertia, out = symmetric(inertial[4:]), np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = inertial[1:4]
+    out[3, 3] = inertial[0]
+    return out
+
+
+def inertial_of_pseudo(pseudo: Array) -> Array:
+    """Ten parameters of a pseudo-inertia matrix (4, 4)."""
+    inertia = np.trace(pseudo[:3, :3]) * np.eye(3) - pseudo[:3, :3]
+    return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[SIX]])
 
 
 def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
     """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
     about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])
+    return np.concatenate([[mass], mass * centre, about[SIX]])
 
 
 def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
@@ -52,8 +74,7 @@ def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
     """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
     mass = max(float(inertial[0]), 1e-6)
     centre = inertial[1:4] / mass
-    about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return mass, centre, symmetric(inertial[4:]) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
 
 
 def mujoco_quaternion(out: Array, axes: Array) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
-from gcomp.arm.inertials import body_parameters, set_body, write_bodies
+from gcomp.arm.inertials import body_parameters, pseudo_inertia, set_body, write_bodies
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilt_gravity
-from sim_gap.effects.link import mount_matrix, pseudo_inertia
+from sim_gap.effects.link import mount_matrix
 from sim_gap.model.load import SimModel, named_spec
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.estimate import EffectEstimate

@@ -5,13 +5,12 @@ from itertools import combinations
 
 import numpy as np
 
+from gcomp.arm.inertials import SIX
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, Ratings, SearchHints, Shape, Signature
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 
-SIX = np.triu_indices(3)
-"""Entries of a symmetric matrix in the order of INERTIAL."""
 LIGHT_KG = 1e-6
 """Least absolute mass of which a centre is taken [kg]."""
 
@@ -60,16 +59,6 @@ def move_mass(inertial: Array, moment: Array) -> Array:
     old, new = inertial[1:4] / mass, (inertial[1:4] + moment) / mass
     change = mass * (new @ new - old @ old) * np.eye(3) - mass * (np.outer(new, new) - np.outer(old, old))
     return np.concatenate([inertial[:1], inertial[1:4] + moment, inertial[4:] + change[SIX]])
-
-
-def pseudo_inertia(inertial: Array) -> Array:
-    """The pseudo-inertia matrix (4, 4) of ten parameters: positive definite for every body that can exist (Wensing)."""
-    inertia = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    out = np.empty((4, 4))
-    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    out[:3, 3] = out[3, :3] = inertial[1:4]
-    out[3, 3] = inertial[0]
-    return out
 
 
 LEVER = 0.15

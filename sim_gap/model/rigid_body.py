@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from gcomp.arm.inertials import symmetric
 from gcomp.arrays import Array, Mask
 
 CREEP = 0.01
@@ -220,11 +221,6 @@ def _turned(start: Array, axis: Array, angle: Array) -> Array:
     sine, versine = np.sin(angle), 1.0 - np.cos(angle)
     parts = start, start @ hat, start @ hat @ hat
     return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
-
-
-def symmetric(six: Array) -> Array:
-    """(…, 6) as xx, xy, xz, yy, yz, zz → (…, 3, 3)."""
-    return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
 
 
 def torque_slopes(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> tuple[Array, Array, Array]:

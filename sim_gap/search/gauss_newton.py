@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from scipy.optimize import minimize
 
+from gcomp.arm.inertials import pseudo_inertia
 from gcomp.arrays import Array
 from gcomp.estimate.exchange import AS_GOOD
-from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate_signals import inertial_change
