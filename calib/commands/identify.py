@@ -1,5 +1,6 @@
 """Identifies gravity parameters from sweeps, or from poses of any robot; keeps a gravity record."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,28 @@ if TYPE_CHECKING:
     from calib.fit.gravity_fit import GravityFit
 
 POSES = "Poses of any robot, with --model"
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Options that only poses have, as they were given."""
+
+    base: str | None = None
+    tip: str | None = None
+    reference_mass: tuple[str, ...] = ()
+    heldout: tuple[Path, ...] = ()
+    gain_std: float | None = None
+    out_model: Path | None = None
+    coefficients: Path | None = None
+    plan: int = 0
+
+    def require_none(self) -> None:
+        """Raise BadInput if one was given."""
+        from armlink.errors import BadInput
+
+        for each in fields(self):
+            if getattr(self, each.name) != each.default:
+                raise BadInput(f"--{each.name.replace('_', '-')}: only for poses: give the robot's model with --model")
 
 
 @reads_recordings
@@ -82,25 +105,15 @@ def identify(
     from calib.records.store import RecordStore
 
     records = RecordStore(store)
-    of_poses = {
-        "base": base,
-        "tip": tip,
-        "reference_mass": reference_mass or [],
-        "heldout": heldout or [],
-        "gain_std": gain_std,
-        "out_model": out_model,
-        "coefficients": coefficients,
-        "plan": plan,
-    }
+    masses, held = tuple(reference_mass or ()), tuple(heldout or ())
+    of_poses = PoseOptions(base, tip, masses, held, gain_std, out_model, coefficients, plan)
     if model is not None:
         if arm is not None or calibration is not None:
             raise BadInput("--arm, --calibration: only for sweeps; poses need --model alone")
         from calib.commands.identify_poses import identify_poses
 
-        return identify_poses(data, model, **of_poses, stated=stated, store=records, json_file=json_file)  # type: ignore[arg-type]
-    for name, value in of_poses.items():
-        if value is not None and (value or name == "gain_std"):
-            raise BadInput(f"--{name.replace('_', '-')}: only for poses: give the robot's model with --model")
+        return identify_poses(data, model, of_poses, stated, records, json_file)
+    of_poses.require_none()
     sweeps, arm_file = load_sweeps(data, arm)
     sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None

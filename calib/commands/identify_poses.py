@@ -18,6 +18,7 @@ from gcomp.identify.motor_model import MotorDoubt
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
     from armlink.recording.corrections import Corrections
+    from calib.commands.identify import PoseOptions
     from calib.records.store import RecordStore
 
 MODEL_SUFFIXES = (".urdf", ".xml")
@@ -84,15 +85,7 @@ def reference_masses(given: Sequence[str], poses: Sequence[Path]) -> dict[str, f
 def identify_poses(
     poses: Sequence[Path],
     model: str,
-    *,
-    base: str | None,
-    tip: str | None,
-    reference_mass: Sequence[str],
-    heldout: Sequence[Path],
-    gain_std: float | None,
-    out_model: Path | None,
-    coefficients: Path | None,
-    plan: int,
+    options: "PoseOptions",
     stated: "Corrections",
     store: "RecordStore",
     json_file: Path | None,
@@ -101,15 +94,16 @@ def identify_poses(
     from armlink.commands.plain_console import results
     from calib.arm.model_files import write_coefficients, write_model
 
-    described = stated_model(model, base, tip)
+    described = stated_model(model, options.base, options.tip)
+    out_model = options.out_model
     if out_model is not None and (described.placed is None or out_model.suffix.lower() not in MODEL_SUFFIXES):
         raise BadInput(
             f"--out-model {out_model}: expected a name that ends in .urdf or .xml, and a URDF or MJCF file as --model"
         )
-    masses = reference_masses(reference_mass, poses)
+    masses = reference_masses(options.reference_mass, poses)
     if masses and not set(map(str, poses)) - set(masses):
         raise BadInput("--reference-mass: a mass hangs in all poses: give poses without it, too")
-    judged = judged_fit(described, poses, heldout, masses, gain_std, stated)
+    judged = judged_fit(described, poses, options.heldout, masses, options.gain_std, stated)
     fit, arm_file, record = judged.fit, described.arm_file, None
     if arm_file is not None:
         kept = fit.gravity.record(arm_file)
@@ -122,10 +116,10 @@ def identify_poses(
     if out_model is not None and described.placed is not None and described.path is not None:
         write_model(described.placed, described.path, fit.gravity.beta, out_model)
         out.print(f"{out_model}: the model with these mass moments, in bodies that can exist")
-    if coefficients is not None:
-        write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, coefficients)
-        out.print(f"{coefficients}: base parameters, and the names of the regressor's columns")
-    further = fit.best_poses(plan) if plan else None
+    if options.coefficients is not None:
+        write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, options.coefficients)
+        out.print(f"{options.coefficients}: base parameters, and the names of the regressor's columns")
+    further = fit.best_poses(options.plan) if options.plan else None
     if further is not None:
         _show_plan(judged, *further, out)
     write_json(json_file, _answer(judged, record, further))
