@@ -18,6 +18,9 @@ from gcomp.arm.load import compile_model
 from gcomp.arrays import Array
 
 NO_BUS = "assumed: there is no bus yet"
+GUESSES = yaml_comment(
+    "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
+)
 ASSUMED_STOP = 2.9
 """Working range of a joint without stops, to either side [rad]; assumed."""
 SPEED = 1.0
@@ -248,9 +251,7 @@ def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
         yaml_comment(f"{draft.name}: made from {draft.model.name} by `armlink new`."),
-        yaml_comment(
-            "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
-        ),
+        GUESSES,
         yaml_entry("name", draft.name),
         yaml_entry("serial", draft.serial),
         "kinematics:",

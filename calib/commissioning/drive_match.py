@@ -14,7 +14,7 @@ from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.findings import FoundDrive, FoundDrives, SetupFinding
 from armlink.errors import BadInput, BusFault
-from calib.commissioning.draft import LEAST_TORQUE
+from calib.commissioning.draft import GUESSES, LEAST_TORQUE
 from calib.commissioning.motion_checks import LEAST_DAMPING
 
 LEAST_TURN = 0.1
@@ -47,6 +47,12 @@ class Match:
     joint: str
     drive: FoundDrive
     by_hand: bool
+
+    @property
+    def note(self) -> str:
+        """Comment for the arm file."""
+        how = "found by turning the joint by hand" if self.by_hand else "assumed: taken in the order of the node ids"
+        return f"node {how}"
 
 
 def match_in_order(names: Sequence[str], drives: FoundDrives, bus: str) -> list[Match]:
@@ -203,9 +209,7 @@ def _text(
     known = matches[0].by_hand
     lines = [
         yaml_comment(f"{name}: made from the drives on {channel} by `armlink new`, without a model."),
-        yaml_comment(
-            "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
-        ),
+        GUESSES,
         yaml_entry("name", name),
         yaml_entry("serial", "unknown", note="assumed"),
         "kinematics:",
@@ -219,8 +223,7 @@ def _text(
         lines.append(yaml_item({**row, "lower": round(lower, 4), "upper": round(upper, 4)}, 4, stop))
     lines += ["link:", yaml_entry("bus", dict(bus), 2), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for match in matches:
-        place = "found by turning the joint by hand" if known else "assumed: taken in the order of the node ids"
-        lines += [yaml_item(_joint(match), 4), yaml_comment(f"node {place}; max_velocity assumed", 6)]
+        lines += [yaml_item(_joint(match), 4), yaml_comment(f"{match.note}; max_velocity assumed", 6)]
         lines += [yaml_comment(note, 6) for note in drive_notes(match.drive)]
     if not known:
         lines += ["sweep:", yaml_entry("hold", "servo", 2, "assumed: the stops are not known")]

@@ -104,8 +104,7 @@ def wired_text(
         findings += _rate(row, match, notes[-1])
         if drive.family == "canopen":
             row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
-        how = "found by turning the joint by hand" if match.by_hand else "assumed: taken in the order of the node ids"
-        notes[-1].append(f"node {how}")
+        notes[-1].append(match.note)
     if bus is not None:
         link["bus"] = edited.in_line(bus)
     if serial:

@@ -91,7 +91,7 @@ def test_an_arm_that_could_be_built_is_believed(seed: int, tmp_path: Path) -> No
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_masses_in_another_unit_are_named(seed: int, factor: float, tmp_path: Path) -> None:
-    """Grams for kilograms, and swap the values 2 and 3: no arm of that size weighs so much, or so little."""
+    """Grams for kilograms, and the other way round: no arm of that size weighs so much, or so little."""
     with pytest.raises(BadInput, match=r"the moving links weigh .* kg at a reach of .* write masses in kg"):
         drafted(DrawnModel(seed, mass_factor=factor).write(tmp_path))
 
