@@ -38,9 +38,8 @@ def stated_model(model: str, base: str | None = None, tip: str | None = None, to
             raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file, or of an arm file")
         with model_budget(path):
             placed = place_chain(path, base=base, tip=tip)
-        arm = placed.arm.arm
-        carried = None if tool is None else parse_tool(tool)
-        return StatedModel(arm, placed, path, placed.arm.beta + tool_moments(arm, carried))
+        moments = tool_moments(placed.arm.arm, None if tool is None else parse_tool(tool))
+        return StatedModel(placed.arm.arm, placed, path, placed.arm.beta + moments)
     if base is not None or tip is not None:
         raise BadInput("--base, --tip: only for a URDF or MJCF file; an arm file describes its chain under kinematics")
     arm_file = with_tool(load_arm(model), tool)

@@ -90,10 +90,9 @@ def _made(model: Any) -> ET.Element:
     """Links and joints of any model: the frame of a link lies on its joint, turned as the body is with all at zero."""
     import mujoco
 
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     if {int(kind) for kind in model.jnt_type} - set(KINDS):
         raise BadInput("--out-model: URDF can hold only hinges and slides: write MJCF (.xml)")
+    data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
     root, name = ET.Element("robot", name="corrected"), {0: "world"}

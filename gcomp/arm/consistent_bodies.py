@@ -32,14 +32,16 @@ def with_moments(placed: PlacedChain, beta: Array) -> Any:
     """
     arm, model = placed.arm.arm, copy.copy(placed.model)
     heaviest = [max(bodies, key=lambda body: float(model.body_mass[body])) for bodies in placed.bodies]
-    own = np.array([_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)])
+    frames = [_body_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)]
+    own = np.array(
+        [body_parameters(model, body, -turn.T @ at, turn) for body, (turn, at) in zip(heaviest, frames, strict=True)]
+    )
     rest = placed.arm.beta - base_parameters(arm, own[:, 0], own[:, 1:4])
     found = closest_bodies(arm, np.array([pseudo_inertia(each) for each in own]), beta - rest)
-    for link, body in enumerate(heaviest):
-        turn, origin = _body_in_bar_frame(placed, link, body)
+    for body, (turn, at), pseudo in zip(heaviest, frames, found, strict=True):
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turn.T, -turn.T @ origin
-        set_body(model, body, np.zeros(3), inertial_of_pseudo(matrix @ found[link] @ matrix.T))
+        matrix[:3, :3], matrix[:3, 3] = turn.T, -turn.T @ at
+        set_body(model, body, np.zeros(3), inertial_of_pseudo(matrix @ pseudo @ matrix.T))
     return model
 
 
@@ -120,9 +122,3 @@ def _body_in_bar_frame(placed: PlacedChain, link: int, body: int) -> tuple[Array
     """(Rotation, origin) of a body's frame in its link's bar frame."""
     bar, data = placed.geometry.bar[link], placed.data
     return bar.T @ data.xmat[body].reshape(3, 3), bar.T @ (data.xpos[body] - placed.geometry.origins[link])
-
-
-def _in_bar_frame(placed: PlacedChain, link: int, body: int) -> Array:
-    """Ten inertial parameters of a body in its link's bar frame."""
-    turn, origin = _body_in_bar_frame(placed, link, body)
-    return body_parameters(placed.model, body, -turn.T @ origin, turn)

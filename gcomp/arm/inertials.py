@@ -54,20 +54,17 @@ def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
 
 def set_body(model: Any, body: int, anchor: Array, total: Array) -> bool:
     """Give a body ten inertial parameters about a point of it, or the closest that can exist; whether it has them."""
+    import mujoco
+
     mass, centre, about = mass_centre_inertia(total)
     values, axes = np.linalg.eigh(about)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    possible = closest_possible(values)
+    spread = np.maximum(0.5 * values.sum() - values, LEAST_SECOND_MOMENT)
+    possible = spread.sum() - spread  # none exceeds the sum of the other two
     model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass, anchor + centre, possible
-    mujoco_quaternion(model.body_iquat[body], axes)
+    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
     model.body_sameframe[body] = 0  # else a body whose frames were one keeps its old centre of mass
     return bool(np.allclose(possible, values, rtol=1e-3, atol=1e-9) and mass == total[0])
-
-
-def closest_possible(principal: Array) -> Array:
-    """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
-    spread = np.maximum(0.5 * principal.sum() - principal, LEAST_SECOND_MOMENT)
-    return np.asarray(spread.sum() - spread)
 
 
 def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
@@ -75,12 +72,6 @@ def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
     mass = max(float(inertial[0]), 1e-6)
     centre = inertial[1:4] / mass
     return mass, centre, symmetric(inertial[4:]) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-
-
-def mujoco_quaternion(out: Array, axes: Array) -> None:
-    import mujoco
-
-    mujoco.mju_mat2Quat(out, axes.ravel())
 
 
 def write_bodies(spec: Any, nominal: Any, model: Any) -> None:

@@ -281,22 +281,13 @@ def fold_sums(
 
     Derivatives of each channel's residual (k, N), residuals (C, N), weights of rows (C, N), fold of each row (N,).
     """
-    members = _members(fold)
+    members = [np.flatnonzero(fold == f) for f in range(int(fold.max()) + 1)]
     squares, products = list[Array](), list[Array]()
     for x, y, w in zip(slopes, residual, weight, strict=True):
         squares.append(np.stack([(x[:, m] * w[m]) @ x[:, m].T for m in members]))
         products.append(np.stack([x[:, m] @ (w[m] * y[m]) for m in members]))
-    return tuple(squares), tuple(products), _sums(weight * residual**2, fold), _sums(weight, fold)
-
-
-def _members(fold: Index) -> list[Index]:
-    """Rows of each fold."""
-    return [np.flatnonzero(fold == f) for f in range(int(fold.max()) + 1)]
-
-
-def _sums(values: Array, fold: Index) -> Array:
-    """Sums of each fold's values (C, N), (C, F)."""
-    return np.stack([values[:, m].sum(1) for m in _members(fold)], axis=1)
+    totals, counts = (np.stack([z[:, m].sum(1) for m in members], axis=1) for z in (weight * residual**2, weight))
+    return tuple(squares), tuple(products), totals, counts
 
 
 def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
@@ -305,11 +296,12 @@ def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> Lin
     weight = problem.weight * robust_weight(about.residual, variance, problem.freedom)
     fold = folds[problem.block]
     squares, products, totals, _ = fold_sums(about.slopes, about.residual, weight, fold)
+    counts = np.stack([problem.weight[:, fold == f].sum(1) for f in range(totals.shape[1])], axis=1)
     away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
     unbounded = np.full(len(away), np.inf)
     return LinearTerms(
-        about.theta, about.acting, squares, products, totals, _sums(problem.weight, fold), variance, problem.floor,
-        away, precision(problem), np.nan_to_num(away), -unbounded, unbounded,
+        about.theta, about.acting, squares, products, totals, counts, variance, problem.floor, away,
+        precision(problem), np.nan_to_num(away), -unbounded, unbounded,
     )  # fmt: skip
 
 
