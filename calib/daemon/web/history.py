@@ -43,7 +43,7 @@ Id = Annotated[int, Field(ge=0, le=LARGEST_ID)]
 
 
 class ApiError(BaseModel):
-    """Every answer that is not 2xx."""
+    """Every refusal of a request; what is not HTTP, and a connection too many, are answered in plain text."""
 
     error: str
     """One line: the problem, and what was expected."""

@@ -43,16 +43,13 @@ from calib.daemon.web.history import (
 from calib.daemon.web.stream import StreamResponse, Streams
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
-    400: {"model": ApiError, "description": "The request is not HTTP, or its Host header is not a name of this daemon"},
+    400: {"model": ApiError, "description": "The Host header is not a name of this daemon, or the body ended early"},
     401: {"model": ApiError, "description": "For TCP only: the token is missing or wrong"},
     408: {"model": ApiError, "description": "The body of the request did not arrive in time"},
     413: {"model": ApiError, "description": "The body of the request is too large"},
     422: {"model": ApiError, "description": "A parameter is not valid"},
     429: {"model": ApiError, "description": "There are too many requests, long answers, or clients on the stream"},
-    503: {
-        "model": ApiError,
-        "description": "The journal cannot be read or written at present, or there are too many clients",
-    },
+    503: {"model": ApiError, "description": "The journal cannot be read or written at present"},
 }
 NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
