@@ -52,12 +52,10 @@ def recalibrate(
     from calib.arm.tool import with_tool
     from calib.fit.field_fit import fit_field
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore, no_record
+    from calib.records.store import RecordStore
 
     arm_file, records = with_tool(load_arm(arm), tool), RecordStore(store)
-    gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
-    if gravity is None:
-        raise no_record(arm_file, "gravity")
+    gravity, before = records.required(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
     rows, sources = _rows(arm_file, data, before if held == "record" else None)
     fit = fit_field(arm_file, rows, gravity, before, {**sources, f"gravity record {gravity.id}": gravity.id})
     record = fit.record(arm_file, before)

@@ -81,14 +81,11 @@ def verify(
 def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
     """The records named, else the current ones; raises Refused where there is no gravity record."""
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import no_record
 
     named = [store.usable(record, arm_file) for record in ids]
     gravity = next((each for each in named if isinstance(each, GravityRecord)), None)
     calibration = next((each for each in named if isinstance(each, CalibrationRecord)), None)
-    gravity = gravity or store.current(GravityRecord, arm_file)
-    if gravity is None:
-        raise no_record(arm_file, "gravity")
+    gravity = gravity or store.required(GravityRecord, arm_file)
     return gravity, calibration or store.current(CalibrationRecord, arm_file)
 
 

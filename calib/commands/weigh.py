@@ -35,15 +35,11 @@ def weigh(
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen, confirm
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore, no_record
+    from calib.records.store import RecordStore
     from calib.sweep.weigh import run_weigh
 
     arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
-    gravity, calibration = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
-    if gravity is None:
-        raise no_record(arm_file, "gravity")
-    if calibration is None:
-        raise no_record(arm_file, "calibration")
+    gravity, calibration = records.required(GravityRecord, arm_file), records.required(CalibrationRecord, arm_file)
     if not yes:
         confirm(f"{arm_file.name} will drive to {poses} poses all over its range, with its load. Is its space clear?")
     with (

@@ -22,7 +22,7 @@ from calib.observer.config import ObserverConfig, Policy
 from calib.observer.decision import DriftFinding
 from calib.observer.rest_detector import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
-from calib.records.store import RecordStore, no_record
+from calib.records.store import RecordStore
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
@@ -146,9 +146,7 @@ class Recalibrator:
         current: CalibrationRecord | None = None,
     ) -> None:
         """Start from the arm's current calibration record (default: as the store has it); raises Refused if none is."""
-        current = current or store.current(CalibrationRecord, arm)
-        if current is None:
-            raise no_record(arm, "calibration")
+        current = current or store.required(CalibrationRecord, arm)
         self.record = current
         self._arm, self._controllers, self._store, self._policy = arm, controllers, store, policy
         self._reference = self._swept(current)

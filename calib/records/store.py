@@ -134,6 +134,13 @@ class RecordStore:
         assert isinstance(record, kind)
         return record
 
+    def required(self, kind: type[R], arm: ArmFile) -> R:
+        """The current record of a kind; raises Refused as `current` does, and where there is none yet."""
+        found = self.current(kind, arm)
+        if found is None:
+            raise no_record(arm, kind.model_fields["kind"].default)
+        return found
+
     def _record(self, record_id: str, body: str) -> AnyRecord:
         """The record of a row; raises StoreFault where the row is not what was stored under its id."""
         if digest_id(body) != record_id:
