@@ -1,6 +1,5 @@
 """Identifies gravity parameters from sweeps, or from poses of any robot; keeps a gravity record."""
 
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,28 +14,6 @@ if TYPE_CHECKING:
     from calib.fit.gravity_fit import GravityFit
 
 POSES = "Poses of any robot, with --model"
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """Options that only poses have, as they were given."""
-
-    base: str | None = None
-    tip: str | None = None
-    reference_mass: tuple[str, ...] = ()
-    heldout: tuple[Path, ...] = ()
-    gain_std: float | None = None
-    out_model: Path | None = None
-    coefficients: Path | None = None
-    plan: int = 0
-
-    def require_none(self) -> None:
-        """Raise BadInput if one was given."""
-        from armlink.errors import BadInput
-
-        for each in fields(self):
-            if getattr(self, each.name) != each.default:
-                raise BadInput(f"--{each.name.replace('_', '-')}: only for poses: give the robot's model with --model")
 
 
 @reads_recordings
@@ -99,6 +76,7 @@ def identify(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
     from calib.api import Calibrated, calibrated, identified
+    from calib.commands.identify_poses import PoseOptions, identify_poses
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep
     from calib.records.records import CalibrationRecord
@@ -110,8 +88,6 @@ def identify(
     if model is not None:
         if arm is not None or calibration is not None:
             raise BadInput("--arm, --calibration: only for sweeps; poses need --model alone")
-        from calib.commands.identify_poses import identify_poses
-
         return identify_poses(data, model, of_poses, stated, records, json_file)
     of_poses.require_none()
     sweeps, arm_file = load_sweeps(data, arm)

@@ -1,7 +1,7 @@
 """`armlink identify` of poses of any robot, with its model: gravity, gains and friction, model files, coefficients."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +18,29 @@ from gcomp.identify.motor_model import MotorDoubt
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
     from armlink.recording.corrections import Corrections
-    from calib.commands.identify import PoseOptions
     from calib.records.store import RecordStore
 
-MODEL_SUFFIXES = (".urdf", ".xml")
+WRITTEN_SUFFIXES = (".urdf", ".xml")
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Options that only poses have, as they were given."""
+
+    base: str | None = None
+    tip: str | None = None
+    reference_mass: tuple[str, ...] = ()
+    heldout: tuple[Path, ...] = ()
+    gain_std: float | None = None
+    out_model: Path | None = None
+    coefficients: Path | None = None
+    plan: int = 0
+
+    def require_none(self) -> None:
+        """Raise BadInput if one was given."""
+        for each in fields(self):
+            if getattr(self, each.name) != each.default:
+                raise BadInput(f"--{each.name.replace('_', '-')}: only for poses: give the robot's model with --model")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +104,7 @@ def reference_masses(given: Sequence[str], poses: Sequence[Path]) -> dict[str, f
 def identify_poses(
     poses: Sequence[Path],
     model: str,
-    options: "PoseOptions",
+    options: PoseOptions,
     stated: "Corrections",
     store: "RecordStore",
     json_file: Path | None,
@@ -96,7 +115,7 @@ def identify_poses(
 
     described = stated_model(model, options.base, options.tip)
     out_model = options.out_model
-    if out_model is not None and (described.placed is None or out_model.suffix.lower() not in MODEL_SUFFIXES):
+    if out_model is not None and (described.placed is None or out_model.suffix.lower() not in WRITTEN_SUFFIXES):
         raise BadInput(
             f"--out-model {out_model}: expected a name that ends in .urdf or .xml, and a URDF or MJCF file as --model"
         )
