@@ -55,7 +55,7 @@ def scout_poses(
     """
     n = kinematics.n
     poses = _free_poses(section, limits, np.random.default_rng(seed), geometry, 2 * (n + 3))
-    chosen = _telling(poses, gravity_regressor(kinematics, poses), 10.0, limits, n + 3)
+    chosen = _informative_poses(poses, gravity_regressor(kinematics, poses), 10.0, limits, n + 3)
     middle = np.mean([sweep_range(section, limits, joint) for joint in range(n)], axis=1)
     return tuple(tuple(pose.tolist()) for pose in nearest_first(chosen, middle))
 
@@ -69,7 +69,7 @@ def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Ar
     geometry = None if arm_file.model_path is None else Geometry(arm_file)
     poses = _free_poses(section, limits, np.random.default_rng([seed, 8]), geometry, count)
     columns = gravity_regressor(kinematics, poses) @ np.column_stack(payload_columns(kinematics))
-    return nearest_first(_telling(poses, columns, 1.0, limits, count), begin)
+    return nearest_first(_informative_poses(poses, columns, 1.0, limits, count), begin)
 
 
 def drawn_poses(section: SweepSection, limits: DriveLimits, count: int, random: np.random.Generator) -> Array:
@@ -90,7 +90,7 @@ def _free_poses(
     return poses
 
 
-def _telling(poses: Array, columns: Array, offset: float, limits: DriveLimits, count: int) -> Array:
+def _informative_poses(poses: Array, columns: Array, offset: float, limits: DriveLimits, count: int) -> Array:
     """The poses (count, n) that tell most (D-optimal) of unknowns with these columns (P, n, p) of torque and of every
     joint's offset, in units of `offset` [N·m]."""
     offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
