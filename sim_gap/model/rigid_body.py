@@ -4,6 +4,7 @@ The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ row
 against MuJoCo's `mj_inverse` when a model is loaded (`sim_gap.model.load`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +17,7 @@ CREEP = 0.01
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-LinkMotion = tuple[list[Array], list[tuple[Array, Array, Array]]]
+LinkMotion = tuple[Sequence[Array], list[tuple[Array, Array, Array]]]
 """Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
 less gravity, in its own frame, (3, K) each."""
 POSITION_STEP = 1e-5
@@ -112,14 +113,14 @@ class RigidArm:
         return replace(self, inertial=inertial)
 
     def torque(
-        self, q: Array, v: Array, a: Array, gravity: Array | None = None, turns: list[Array] | None = None
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
     ) -> Array:
         """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n).
 
         q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's; `turns` as in
         `motion`.
         """
-        turns, moves = self.motion(q, v, a, gravity, turns)
+        turns, moves = self.motion(q, v, a, gravity, turns=turns)
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
             mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], symmetric(self.inertial[j, 4:])
@@ -154,7 +155,7 @@ class RigidArm:
         return _turned(self.rotation[joint], self.axis[joint], q - self.zero[joint])
 
     def motion(
-        self, q: Array, v: Array, a: Array, gravity: Array | None = None, turns: list[Array] | None = None
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
     ) -> LinkMotion:
         """How the links move, from base to tip; `turns` are their rotations at q, where they are known."""
         field = self.gravity if gravity is None else gravity
@@ -235,7 +236,7 @@ def symmetric(six: Array) -> Array:
 
 
 def torque_slopes(
-    arm: RigidArm, turns: list[Array], q: Array, v: Array, a: Array, joint: int
+    arm: RigidArm, turns: Sequence[Array], q: Array, v: Array, a: Array, joint: int
 ) -> tuple[Array, Array, Array]:
     """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each; `turns` are the links' rotations at q.
 
@@ -251,4 +252,4 @@ def torque_slopes(
 
     by_position = (changed(POSITION_STEP, 0.0) - changed(-POSITION_STEP, 0.0)) / (2.0 * POSITION_STEP)
     by_velocity = (changed(0.0, 1.0) - changed(0.0, -1.0)) / 2.0
-    return by_position, by_velocity, arm.torque(q, np.zeros_like(v), np.zeros_like(a) + unit, np.zeros(3), turns)
+    return by_position, by_velocity, arm.torque(q, np.zeros_like(v), np.zeros_like(a) + unit, np.zeros(3), turns=turns)
