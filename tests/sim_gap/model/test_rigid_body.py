@@ -73,24 +73,15 @@ def test_regressor_columns_are_finite_differences_of_mujocos_torque():
         np.testing.assert_allclose(slope, moved[..., 1], atol=1e-4)
 
 
-def test_torque_is_that_of_pinocchio(tmp_path):
+def test_torque_and_its_slopes_are_those_of_pinocchio(tmp_path):
     pin = pytest.importorskip("pinocchio")
     path = tmp_path / "arm.xml"
     path.write_text(THREE)
     model = pin.buildModelFromMJCF(str(path))
     arm, (q, v, a) = load_model(path).arm, states(3)
-    expected = [pin.rnea(model, model.createData(), *row) for row in zip(q, v, a, strict=True)]
+    rows, data = list(zip(q, v, a, strict=True)), model.createData()
+    expected = [pin.rnea(model, model.createData(), *row) for row in rows]
     np.testing.assert_allclose(arm.torque(q, v, a), expected, atol=1e-9)
-
-
-def test_slopes_of_the_torque_are_those_of_pinocchio(tmp_path):
-    pin = pytest.importorskip("pinocchio")
-    path = tmp_path / "arm.xml"
-    path.write_text(THREE)
-    model = pin.buildModelFromMJCF(str(path))
-    arm, (q, v, a) = load_model(path).arm, states(3)
-    data = model.createData()
-    rows = zip(q, v, a, strict=True)
     expected = np.array([np.copy(pin.computeRNEADerivatives(model, data, *row)) for row in rows])
     for joint in range(3):
         slopes = torque_slopes(arm, arm.motion(q, v, a)[0], q, v, a, joint)
