@@ -4,6 +4,7 @@ The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ row
 against MuJoCo's `mj_inverse` when a model is loaded (`sim_gap.model.load`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,7 +18,7 @@ CREEP = 0.01
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-LinkMotion = tuple[list[Array], list[tuple[Array, Array, Array]]]
+LinkMotion = tuple[Sequence[Array], list[tuple[Array, Array, Array]]]
 """Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
 less gravity, in its own frame, (3, K) each."""
 POSITION_STEP = 1e-5
@@ -112,12 +113,15 @@ class RigidArm:
     def with_inertial(self, inertial: Array) -> "RigidArm":
         return replace(self, inertial=inertial)
 
-    def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
+    def torque(
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
+    ) -> Array:
         """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n).
 
-        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
+        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's; `turns` as in
+        `motion`.
         """
-        turns, moves = self.motion(q, v, a, gravity)
+        turns, moves = self.motion(q, v, a, gravity, turns=turns)
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
             mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], symmetric(self.inertial[j, 4:])
@@ -147,15 +151,20 @@ class RigidArm:
             i = self.parent[i]
         return np.moveaxis(out, -1, 0)
 
-    def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> LinkMotion:
-        """How the links move, from base to tip."""
+    def turn(self, joint: int, q: Array) -> Array:
+        """Rotation of a link against the one before it, at its joint's positions (K,) [rad], (3, 3, K)."""
+        return _turned(self.rotation[joint], self.axis[joint], q - self.zero[joint])
+
+    def motion(
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
+    ) -> LinkMotion:
+        """How the links move, from base to tip; `turns` are their rotations at q, where they are known."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
         base = still, still, still - np.asarray(field, float)[:, None]
-        turns: list[Array] = []
+        turns = turns or [self.turn(j, q[:, j]) for j in range(self.n)]
         moves: list[tuple[Array, Array, Array]] = []
-        for j in range(self.n):
-            turn = _turned(self.rotation[j], self.axis[j], q[:, j] - self.zero[j])
+        for j, turn in enumerate(turns):
             omega, alpha, push = moves[self.parent[j]] if self.parent[j] >= 0 else base
             if self.parent[j] >= 0:
                 lever = self.offset[j]
@@ -163,7 +172,6 @@ class RigidArm:
             omega, alpha, push = into_frame(turn, omega), into_frame(turn, alpha), into_frame(turn, push)
             spin = self.axis[j][:, None] * v[:, j]
             alpha = alpha + self.axis[j][:, None] * a[:, j] + cross(omega, spin)
-            turns.append(turn)
             moves.append((omega + spin, alpha, push))
         return turns, moves
 
@@ -223,15 +231,21 @@ def _turned(start: Array, axis: Array, angle: Array) -> Array:
     return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
 
 
-def torque_slopes(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> tuple[Array, Array, Array]:
-    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each.
+def torque_slopes(
+    arm: RigidArm, turns: Sequence[Array], q: Array, v: Array, a: Array, joint: int
+) -> tuple[Array, Array, Array]:
+    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each; `turns` are the links' rotations at q.
 
-    By central differences, which are exact in v and a: the torque is quadratic in the one and linear in the other.
+    By central differences in q and v, which are exact in v: the torque is quadratic in it. ∂τ/∂a is a column of M(q).
     """
-    unit, slopes = np.eye(arm.n)[joint], []
-    for k, step in enumerate((POSITION_STEP, 1.0, 1.0)):
-        more, less = (
-            arm.torque(*(x + sign * step * unit * (i == k) for i, x in enumerate((q, v, a)))) for sign in (1.0, -1.0)
-        )
-        slopes.append((more - less) / (2.0 * step))
-    return slopes[0], slopes[1], slopes[2]
+    unit = np.eye(arm.n)[joint]
+
+    def changed(angle: float, speed: float) -> Array:
+        own = turns
+        if angle:
+            own = [*turns[:joint], arm.turn(joint, q[:, joint] + angle), *turns[joint + 1 :]]
+        return arm.torque(q, v + speed * unit, a, turns=own)
+
+    by_position = (changed(POSITION_STEP, 0.0) - changed(-POSITION_STEP, 0.0)) / (2.0 * POSITION_STEP)
+    by_velocity = (changed(0.0, 1.0) - changed(0.0, -1.0)) / 2.0
+    return by_position, by_velocity, arm.torque(q, np.zeros_like(v), np.zeros_like(a) + unit, np.zeros(3), turns=turns)

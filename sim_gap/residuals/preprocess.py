@@ -146,9 +146,8 @@ class PreparedSignals:
 
     def link_regressor(self, link: int) -> Array:
         """Columns of the model torque in a link's inertial parameters, (K, n, 10)."""
-        read = self.read
-        if read is not self and read.q is self.q and np.array_equal(read.arm.gravity, self.arm.gravity):
-            return read.link_regressor(link)
+        if self.read is not self and self._moves_as_read:
+            return self.read.link_regressor(link)
         return self.arm.link_regressor(self._motion, link)
 
     @cached_property
@@ -157,9 +156,17 @@ class PreparedSignals:
 
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
         """Derivatives of the model torque with respect to one joint's position, velocity, acceleration, (K, n) each."""
+        read, own = self.read, self.arm
+        if read is not self and self._moves_as_read and np.array_equal(read.arm.inertial, own.inertial):
+            return read.sensitivity(joint)
         if joint not in self._sensitivities:
-            self._sensitivities[joint] = torque_slopes(self.arm, self.q, self.v, self.a, joint)
+            self._sensitivities[joint] = torque_slopes(own, self._motion[0], self.q, self.v, self.a, joint)
         return self._sensitivities[joint]
+
+    @property
+    def _moves_as_read(self) -> bool:
+        """Whether the estimate has the positions and the gravity that were there before it."""
+        return self.read.q is self.q and np.array_equal(self.read.arm.gravity, self.arm.gravity)
 
     @cached_property
     def _sensitivities(self) -> dict[int, tuple[Array, Array, Array]]:

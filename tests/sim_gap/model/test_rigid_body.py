@@ -8,7 +8,7 @@ from wrong_arms import THREE
 from armlink.errors import BadInput
 from sim_gap.effects.link import moment_to_inertia
 from sim_gap.model.load import load_model, rigid_arm
-from sim_gap.model.rigid_body import RigidArm
+from sim_gap.model.rigid_body import RigidArm, torque_slopes
 
 
 def random_arm(n: int, seed: int) -> str:
@@ -73,14 +73,22 @@ def test_regressor_columns_are_finite_differences_of_mujocos_torque():
         np.testing.assert_allclose(slope, moved[..., 1], atol=1e-4)
 
 
-def test_torque_is_that_of_pinocchio(tmp_path):
+def test_torque_and_its_slopes_are_those_of_pinocchio(tmp_path):
     pin = pytest.importorskip("pinocchio")
     path = tmp_path / "arm.xml"
     path.write_text(THREE)
     model = pin.buildModelFromMJCF(str(path))
     arm, (q, v, a) = load_model(path).arm, states(3)
-    expected = [pin.rnea(model, model.createData(), *row) for row in zip(q, v, a, strict=True)]
+    rows, data = list(zip(q, v, a, strict=True)), model.createData()
+    expected = [pin.rnea(model, model.createData(), *row) for row in rows]
     np.testing.assert_allclose(arm.torque(q, v, a), expected, atol=1e-9)
+    expected = np.array([np.copy(pin.computeRNEADerivatives(model, data, *row)) for row in rows])
+    for joint in range(3):
+        slopes = torque_slopes(arm, arm.motion(q, v, a)[0], q, v, a, joint)
+        np.testing.assert_allclose(slopes[0], expected[:, 0, :, joint], atol=1e-6)
+        np.testing.assert_allclose(slopes[1], expected[:, 1, :, joint], atol=1e-9)
+        columns = np.triu(expected[:, 2]) + np.swapaxes(np.triu(expected[:, 2], 1), 1, 2)
+        np.testing.assert_allclose(slopes[2], columns[:, :, joint], atol=1e-9)
 
 
 def test_joint_terms_of_the_model_count_on_the_motor_side_and_springs_beside_it():

@@ -127,4 +127,3 @@ def test_what_columns_were_computed_from_is_freed_with_them():
     signals.sensitivity(0)
     equations.store.release()
     assert "_sensitivities" not in vars(signals)
-    assert "_wrenches" not in vars(signals)
