@@ -208,8 +208,9 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         if order.power is Power.ON and known.on:
             known.stopping, data = False, self._command(joint, order)
         elif order.power is Power.ON and order.walk and not (known.on or known.error or known.restarted):
-            # by position whatever the mode is: a torque does not open a brake
-            data = self._command(joint, order._replace(mode=Mode.POSITION, position=known.position))
+            # by position whatever the mode is, for a torque does not open a brake: the ordered one, which is bounded
+            position = order.position if order.mode == Mode.POSITION else known.position
+            data = self._command(joint, order._replace(mode=Mode.POSITION, position=position))
             known.awaited, known.stopped = data[0], False
         elif order.power is Power.STOPPED and known.on:
             if not known.stopping:
