@@ -8,6 +8,7 @@ from armlink.errors import Silence
 from armlink.link import gate
 from armlink.link.bus_watchdog import BusWatch
 from armlink.link.gate import Corroboration, JointLimits, Seen
+from armlink.link.gate_limits import OVERSPEED, SERVO_OVERSPEED, SERVO_SPEED
 from armlink.link.types import Command
 
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
@@ -73,9 +74,10 @@ def refusal(
             )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
-                f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, the limit is "
-                f"{limit.servo_overspeed:.3g} rad/s (3 × max_velocity, at least 3 rad/s){_by_positions(now, other)}: "
-                "something else moves the joint, or its position loop is unstable"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, "
+                f"the limit is {limit.servo_overspeed:.3g} rad/s ({SERVO_OVERSPEED:g} × max_velocity, at least "
+                f"{SERVO_SPEED:g} rad/s){_by_positions(now, other)}: something else moves the joint, or its position "
+                "loop is unstable"
             )
         if why == gate.FOLLOWING:
             return (
@@ -86,8 +88,8 @@ def refusal(
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, the limit is "
-                f"{gate.speed_limit(limit, other):.3g} rad/s (1 to 1.4 × max_velocity){_by_positions(now, other)}: "
-                "command less torque, or raise max_velocity"
+                f"{gate.speed_limit(limit, other):.3g} rad/s (1 to {OVERSPEED:g} × max_velocity)"
+                f"{_by_positions(now, other)}: command less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside

@@ -33,9 +33,9 @@ ASKED_CYCLES = 5
 def announcement(arm: ArmFile) -> str:
     """The test with power in sentences, for a person who is asked before it begins."""
     groups, deadline = make_groups(arm), arm.require_link().deadline * 1e3
-    drives: dict[str, list[str]] = {}
-    for name, (group, place) in zip(arm.joint_names, by_joint(groups), strict=True):
-        drives.setdefault(f"{group.drives.traits(place).silence} ({group.family.name})", []).append(name)
+    traits, drives = traits_of(groups), dict[str, list[str]]()
+    for name, (group, _), each in zip(arm.joint_names, by_joint(groups), traits, strict=True):
+        drives.setdefault(f"{each.silence} ({group.family.name})", []).append(name)
     steps = groups[0].family.self_test_steps.format(deadline=deadline) if len(groups) == 1 else ""
     if not steps:
         told = "; ".join(f"{', '.join(names)}: {drive}" for drive, names in drives.items())
@@ -45,7 +45,7 @@ def announcement(arm: ArmFile) -> str:
             f"turned by {LEAN} rad before that."
         )
     end = "the joints hold, in quick stop"
-    if not all(drive.startswith("holds") for drive in drives):
+    if not all(each.silence == "holds" for each in traits):
         end = "the arm is parked or slowly lowered, and its power switched off"
     return (
         f"This test enables every joint of {arm.name} and lets it hold where it stands (with at most its max_torque). "

@@ -20,7 +20,6 @@ STALL, ENCODER = 0x0002, 0x2000
 """Errors: of the first level, which only a restart ends; of the second, which ends by itself."""
 KEPT = frozenset((0x20, 0x32, 0x43, 0x63, 0x64))
 """Commands that write the flash, besides that of the time-out."""
-READINGS = ("position", "velocity", "torque")
 
 
 class MyActuatorDrive(SimulatedDrive):
@@ -66,7 +65,7 @@ class MyActuatorDrive(SimulatedDrive):
             return
         if command in (0x9C, 0xA1, 0xA2, 0xA4):
             self._obey(command, data)
-            self.tell(lambda: self._reply(self._state(command)), READINGS)
+            self.tell(lambda: self._reply(self._state(command)))
         elif command == 0x92:
             self.tell(lambda: self._reply(self._angle()), ("position",))
         elif command in (0x77, 0x78, 0x80, 0x81):  # it has no brake to release or to lock
@@ -154,7 +153,6 @@ class MyActuatorDrive(SimulatedDrive):
     def _enter(self, mode: int) -> None:
         if self.mode != mode:
             self.mode, self._target, self._most_speed = mode, self.motor.position, math.inf
-            self._integral = 0.0 if self.mode == CURRENT_LOOP else self._integral
 
     def _leave(self) -> None:
         self.mode, self._integral = NO_LOOP, 0.0

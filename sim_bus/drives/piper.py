@@ -104,7 +104,7 @@ class PiperJoint(SimulatedDrive):
                 if period == STATE_PERIOD:
                     self.answer(0x260 + self.number, self._state())
                 else:
-                    self.tell(self._send_motion, ("position", "velocity", "torque"))
+                    self.tell(self._send_motion)
 
     def _send_motion(self) -> None:
         _, velocity, torque = self.told()

@@ -1,6 +1,6 @@
 """All imperfections of a simulated arm as arrays: effects write them; plant, drives and sensors read them."""
 
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +104,7 @@ class Imperfections:
     def __init__(self, names: tuple[str, ...]) -> None:
         """Shapes as annotated, where "n" stands for the number of joints; by default (n,)."""
         self.names = names
-        for name, kind in list(get_type_hints(type(self), include_extras=True).items())[1:]:
+        for name, kind in list(type(self).__annotations__.items())[1:]:
             shape = tuple(len(names) if size == "n" else size for size in getattr(kind, "__metadata__", ("n",)))
             setattr(self, name, np.full(shape, INITIAL.get(name, 0.0)))
 

@@ -10,9 +10,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Annotated, Literal, TypeVar
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field, model_validator
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
 from armlink.drives.base import BROADCAST, Ask, BasicDrives, DriveMemory, no_order
@@ -20,9 +22,9 @@ from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.myactuator import frames
 from armlink.drives.myactuator.frames import ANGLE, COMMAND_ID, CURRENT, LAST_ID, REPLY_ID, RmdCommand, request
-from armlink.drives.myactuator.settings import MyActuatorSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.searched_bus import SearchedBus
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
@@ -37,6 +39,45 @@ LOADED = 0.02
 """A torque above this share of its limit shows whether the drive still makes it."""
 FOLLOWS = 0.5
 """A drive that makes less than this share of the torque that it made before does not follow any more."""
+LEAST_GEAR = 6.0
+"""Of all models: a constant that is smaller by more than its root is nearer to the motor's than to the output's."""
+
+
+class MyActuatorSettings(DriveSettings):
+    """A MyActuator RMD-X drive (V3 protocol)."""
+
+    family: Literal["myactuator"] = "myactuator"
+    id: Annotated[int, Field(ge=1, le=LAST_ID)]
+    model: str = ""
+    """As on the label or as the drive tells it: its torque constant, where the key below does not give it."""
+    torque_constant: Positive | None = None
+    """Torque at the output for one ampere [N·m/A]; None: rated torque over rated current of the model."""
+    timeout_ms: Annotated[int, Field(ge=0, le=2500)] = 0
+    """Time-out of communication (B3h) as it was stored in the drive [ms]; 0: none, the drive keeps on."""
+
+    @model_validator(mode="after")
+    def _constant_is_known(self) -> "MyActuatorSettings":
+        if self.torque_constant is None and self.model not in frames.RATINGS:
+            raise ValueError(
+                f"model {self.model!r} is unknown: give one of {', '.join(frames.RATINGS)}, or give torque_constant, "
+                "the rated torque over the rated current of the data sheet"
+            )
+        usual = frames.torque_constant(self.model) if self.model in frames.RATINGS else 0.0
+        if self.torque_constant is not None and self.torque_constant < usual / math.sqrt(LEAST_GEAR):
+            raise ValueError(
+                f"torque_constant {self.torque_constant:g} is that of the motor before the gear, by the ratings of an "
+                f"{self.model} ({usual:.3g} N·m/A at the output): currents would be too large"
+            )
+        return self
+
+    @property
+    def constant(self) -> float:
+        """[N·m/A]."""
+        return self.torque_constant or frames.torque_constant(self.model)
+
+    @property
+    def address(self) -> str:
+        return f"id {self.id}"
 
 
 @dataclass
@@ -167,8 +208,9 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         if order.power is Power.ON and known.on:
             known.stopping, data = False, self._command(joint, order)
         elif order.power is Power.ON and order.walk and not (known.on or known.error or known.restarted):
-            # by position whatever the mode is: a torque does not open a brake
-            data = self._command(joint, order._replace(mode=Mode.POSITION, position=known.position))
+            # by position whatever the mode is, for a torque does not open a brake: the ordered one, which is bounded
+            position = order.position if order.mode == Mode.POSITION else known.position
+            data = self._command(joint, order._replace(mode=Mode.POSITION, position=position))
             known.awaited, known.stopped = data[0], False
         elif order.power is Power.STOPPED and known.on:
             if not known.stopping:

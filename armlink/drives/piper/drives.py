@@ -6,7 +6,7 @@ that stands, or is driven by its own host.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -40,7 +40,7 @@ class PiperSettings(DriveSettings):
     family: Literal["piper"] = "piper"
     joint: Annotated[int, Field(ge=1, le=6)]
     """From the base on."""
-    firmware: Annotated[str, Field(pattern=r"^S-V\d+\.\d+-\d+$")]
+    firmware: Annotated[str, Field(pattern=f"^{frames.FIRMWARE}$")]
     """Of the arm's controller, as `armlink scan` tells it: the scale of torques depends on it."""
     torque_constant: Positive | None = None
     """[N·m/A]; None: as the maker's SDK has it."""
@@ -152,12 +152,17 @@ class PiperDrives(BasicDrives[PiperMemory]):
         if len(data) != 8:
             board.errors += 1
             return
-        first = 2 * (can_id - frames.POSITIONS_ID) + 1
-        for number, position in zip((first, first + 1), frames.unpack_positions(data), strict=True):
-            joint = self._joint_of.get(number)
-            if joint is not None:
-                self.memory[joint].position = position
-                board.reading(places[joint], position, math.nan)
+        for joint, position in self._of_two(frames.POSITIONS_ID, can_id, data):
+            self.memory[joint].position = position
+            board.reading(places[joint], position, math.nan)
+
+    def _of_two(self, base: int, can_id: int, data: bytes) -> list[tuple[int, float]]:
+        """Joints and their positions [rad], or targets, where a frame has those of two, by `base`."""
+        first = 2 * (can_id - base) + 1
+        if first not in (1, 3, 5) or len(data) != 8:
+            return []
+        pairs = zip((first, first + 1), frames.unpack_positions(data), strict=True)
+        return [(self._joint_of[number], position) for number, position in pairs if number in self._joint_of]
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         if len(data) != 8:
@@ -166,7 +171,8 @@ class PiperDrives(BasicDrives[PiperMemory]):
             self._arm_fault = frames.ARM_FAULTS.get(data[1], "")
         joint = self._joint_of.get(can_id & 0xF) if can_id & ~0xF in (frames.MOTION_ID, frames.STATE_ID) else None
         if joint is None:
-            self._note_positions(can_id, data)
+            for each, position in self._of_two(frames.POSITIONS_ID, can_id, data):  # no board takes them before a cycle
+                self.memory[each].position = position
             return None
         known, settings = self.memory[joint], self.settings[joint]
         if can_id & ~0xF == frames.MOTION_ID:
@@ -178,26 +184,15 @@ class PiperDrives(BasicDrives[PiperMemory]):
         power = Power.FAULT if fault else on
         return self.note(Reading(joint, temperature=temperature, power=power, fault=fault))
 
-    def _note_positions(self, can_id: int, data: bytes) -> None:
-        """Where no board takes them: before a cycle."""
-        first = 2 * (can_id - frames.POSITIONS_ID) + 1
-        if first in (1, 3, 5):
-            for number, position in zip((first, first + 1), frames.unpack_positions(data), strict=True):
-                if (joint := self._joint_of.get(number)) is not None:
-                    self.memory[joint].position = position
-
     # ---- beside its host
 
     def commands_of(self, can_id: int, data: bytes) -> list[tuple[int, Order]]:
-        first = 2 * (can_id - frames.TARGETS_ID) + 1
-        if first not in (1, 3, 5) or len(data) != 8:
-            return super().commands_of(can_id, data)
-        targets = zip((first, first + 1), frames.unpack_positions(data), strict=True)
+        targets = self._of_two(frames.TARGETS_ID, can_id, data)
         order = no_order()._replace(mode=Mode.POSITION, torque=0.0, kp=0.0, kd=0.0)
-        return [(self._joint_of[n], order._replace(position=at)) for n, at in targets if n in self._joint_of]
+        return [(joint, order._replace(position=at)) for joint, at in targets] or super().commands_of(can_id, data)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """A command to one joint, or the first of two."""
+        """A command to one joint, or to all."""
         if len(data) != 8:
             return None
         if can_id == frames.STOP_ID and data[0] == 1:
@@ -209,7 +204,7 @@ class PiperDrives(BasicDrives[PiperMemory]):
         joint = self._joint_of.get(can_id - frames.MIT_ID + 1)
         command = None if joint is None else frames.unpack_mit(data)
         if joint is None or command is None:
-            return next(iter(self.commands_of(can_id, data)), None) if 0 <= can_id - frames.TARGETS_ID < 3 else None
+            return None
         torque = command.torque * self.settings[joint].amplification
         return joint, order_of(command._replace(torque=torque))
 
@@ -234,10 +229,10 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
         return []
     firmware = read_firmware(bus)
     note = "" if firmware else "the arm does not report its firmware: S-V1.8-2 assumed"
-    keys: Iterator[dict[str, int | str]] = ({"joint": n, "firmware": firmware or "S-V1.8-2"} for n in JOINTS)
+    stated = firmware or "S-V1.8-2"
     return [
-        FoundDrive("piper", number, f"joint {number}", each, model="AgileX Piper", note=note)
-        for number, each in zip(JOINTS, keys, strict=True)
+        FoundDrive("piper", n, f"joint {n}", {"joint": n, "firmware": stated}, model="AgileX Piper", note=note)
+        for n in JOINTS
     ]
 
 

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator
 from enum import IntFlag
 
-from armlink.drives.mit_packing import MitCommand
+from armlink.drives.mit_packing import MitCommand, PackedField
 
 JOINTS = range(1, 7)
 STOP_ID, MODE_ID, TARGETS_ID, MIT_ID, ENABLE_ID, FIRMWARE_ID = 0x150, 0x151, 0x155, 0x15A, 0x471, 0x4AF
@@ -28,10 +28,12 @@ TORQUE_CONSTANTS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
 AMPLIFIED, AMPLIFIED_UNTIL = 4.0, (1, 8, 2)
 """Joints 1 to 3 make so many times the torque of an MIT command and a quarter of what their current tells, up to this
 firmware."""
-POSITION_RANGE, SPEED_RANGE, TORQUE_RANGE = 12.5, 45.0, 8.0
-"""Ends of what an MIT command can say [rad], [rad/s], [N·m]."""
-LARGEST_KP, LARGEST_KD = 500.0, 5.0
+MIT_POSITION, MIT_VELOCITY = PackedField(-12.5, 12.5, 16), PackedField(-45.0, 45.0, 12)
+MIT_KP, MIT_KD, MIT_TORQUE = PackedField(0.0, 500.0, 12), PackedField(-5.0, 5.0, 12), PackedField(-8.0, 8.0, 8)
+"""Fields of an MIT command [rad], [rad/s], [N·m/rad], [N·m·s/rad], [N·m]; the zero of kd lies between two steps."""
 ENABLE, DISABLE = 2, 1
+FIRMWARE = r"S-V\d+\.\d+-\d+"
+"""Pattern of a firmware, such as S-V1.8-2."""
 
 
 class PiperState(IntFlag):
@@ -62,16 +64,10 @@ ARM_FAULTS = {
 _PAIR, _MOTION, _STATE = struct.Struct(">ii"), struct.Struct(">hhi"), struct.Struct(">HhbBH")
 
 
-def version(firmware: str) -> tuple[int, int, int] | None:
-    """Of a text like S-V1.8-2; None for another."""
-    found = re.fullmatch(r"S-V(\d+)\.(\d+)-(\d+)", firmware)
-    return (int(found[1]), int(found[2]), int(found[3])) if found else None
-
-
 def amplification(joint: int, firmware: str) -> float:
     """By which a joint of an arm with this firmware makes more torque than an MIT command says."""
-    number = version(firmware)
-    return AMPLIFIED if joint <= 3 and number is not None and number <= AMPLIFIED_UNTIL else 1.0
+    number = tuple(map(int, re.findall(r"\d+", firmware)))
+    return AMPLIFIED if joint <= 3 and number <= AMPLIFIED_UNTIL else 1.0
 
 
 def unpack_positions(data: bytes) -> tuple[float, float]:
@@ -101,24 +97,17 @@ def checksum(data: bytes) -> int:
 
 
 def unpack_mit(data: bytes) -> MitCommand | None:
-    """An MIT command of eight bytes, its torque as it is said; None with a wrong checksum.
-
-    kd goes from -5 to 5: its zero lies between two steps.
-    """
+    """An MIT command of eight bytes, its torque as it is said; None with a wrong checksum."""
     bits = int.from_bytes(data, "big")
     if bits & 0xF != checksum(data):
         return None
     return MitCommand(
-        _value(bits >> 48, 16, POSITION_RANGE),
-        _value(bits >> 36 & 0xFFF, 12, SPEED_RANGE),
-        (bits >> 24 & 0xFFF) / 0xFFF * LARGEST_KP,
-        max(_value(bits >> 12 & 0xFFF, 12, LARGEST_KD), 0.0),
-        _value(bits >> 4 & 0xFF, 8, TORQUE_RANGE),
+        MIT_POSITION.value(bits >> 48),
+        MIT_VELOCITY.value(bits >> 36 & 0xFFF),
+        MIT_KP.value(bits >> 24 & 0xFFF),
+        max(MIT_KD.value(bits >> 12 & 0xFFF), 0.0),
+        MIT_TORQUE.value(bits >> 4 & 0xFF),
     )
-
-
-def _value(steps: int, bits: int, end: float) -> float:
-    return steps * 2 * end / ((1 << bits) - 1) - end
 
 
 def firmware_request() -> bytes:
@@ -127,7 +116,7 @@ def firmware_request() -> bytes:
 
 def firmware_in(pieces: Iterator[bytes]) -> str:
     """The firmware in the text that the arm answers with; empty if it is not in it."""
-    found = re.search(rb"S-V\d+\.\d+-\d+", b"".join(pieces))
+    found = re.search(FIRMWARE.encode(), b"".join(pieces))
     return found[0].decode() if found else ""
 
 

@@ -24,8 +24,7 @@ class ForeignHost:
         `forgets`: a command counts for one cycle; otherwise until the next to its joint.
         """
         self._forgets = forgets
-        self._groups, self._values = tuple(groups), values
-        self._n = sum([len(group.places) for group in groups])
+        self._values, self._n = values, sum([len(group.places) for group in groups])
         syncs = [can_id | group.tag for group in groups for can_id in group.drives.cycle_ids()]
         self._sync = min(syncs, default=None)
         """SYNC of the first bus that has one begins a cycle."""

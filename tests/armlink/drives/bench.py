@@ -99,6 +99,10 @@ class Bench:
         if self.fast:  # its frames do not pass `take`: readings as the set-up found them
             self.latest = [Reading(joint, each.position) for joint, each in enumerate(setups)]
             self.fast = self.drives.fill(self.board, range(self.arm.n))
+        self.latest = [  # a walk begins where a joint stands, as the link's does
+            reading if math.isfinite(reading.position) else reading._replace(position=each.position)
+            for reading, each in zip(self.latest, setups, strict=True)
+        ]
         return setups
 
     def cycle(self, orders: Sequence[Order | None]) -> list:

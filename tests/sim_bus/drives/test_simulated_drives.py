@@ -12,7 +12,7 @@ import pytest
 from serving import pendulum
 
 from armlink.arm_file import parse_arm
-from armlink.bus.port import CLASSICAL
+from armlink.bus.port import CLASSICAL, EXTENDED
 from armlink.drives.damiao import frames as damiao
 from armlink.drives.mit_packing import MitCommand, Ranges, Special, grid_of, pack_command, special
 from armlink.errors import BadInput
@@ -51,6 +51,28 @@ def command(**values):
 
 
 ENABLE = special(Special.ENABLE)
+
+
+# ---- identifiers by the makers' manuals, which the host's code and the simulation share
+
+
+def test_a_robstride_drive_tells_host_feh_who_it_is():
+    arm = simulated({"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0})
+    arm.on_frame(0x0000FD03 | EXTENDED, bytes(8))
+    assert [can_id for can_id, _ in arm.outbox] == [0x000003FE | EXTENDED]
+
+
+def test_a_robstride_drive_that_no_host_has_asked_sends_its_fault_of_the_encoder_to_host_fdh():
+    arm = simulated({"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0})
+    arm.device(0).lose_feedback()
+    arm.on_frame(0x0300FD03 | EXTENDED, bytes(8))
+    ((can_id, _),) = arm.outbox
+    assert (can_id & 0x1F00FFFF, can_id >> 16 & 0x3F) == (0x020003FD, 0b001000)
+
+
+def test_a_damiao_drive_hears_the_identifiers_of_all_its_modes():
+    drive = simulated(DAMIAO).device(0)
+    assert [each for each in range(0x800) if drive.takes(each)] == [0x002, 0x102, 0x202, 0x302, 0x7FF]
 
 
 # ---- several families on one arm

@@ -1,5 +1,7 @@
 """The CiA 402 table against the standard's own bit patterns, exhaustively."""
 
+import itertools
+
 import pytest
 
 from armlink.drives.canopen.cia402 import (
@@ -13,6 +15,7 @@ from armlink.drives.canopen.cia402 import (
     state_of,
     supports,
 )
+from sim_bus.node import cia402 as simulated
 
 # CiA 402, table of the status word: bits 6, 5, 3..0 as the standard prints them (x: does not matter).
 PATTERNS = {
@@ -109,6 +112,20 @@ def test_every_status_word_and_every_command_keeps_to_the_drives_own_state_machi
             assert (state is DriveState.UNKNOWN) == (after is DriveState.UNKNOWN)
             if after is not DriveState.UNKNOWN:
                 assert state_of(bits[after]) is after
+
+
+def test_a_simulated_drive_keeps_to_the_standard_in_every_state_and_by_every_control_word():
+    """It shares the names of states and commands with the link, and nothing else: its tables are its own."""
+    for state, pattern in PATTERNS.items():
+        assert matches(pattern, simulated.STATUS[state])
+        for word, previous in itertools.product(range(256), (0x00, 0x80)):
+            asked = command_of(word)
+            after = TRANSITIONS.get((state, asked), state)
+            if asked is Control.FAULT_RESET and previous & 0x80:  # it is an edge
+                after = state
+            if (state, asked) == (DriveState.READY, Control.ENABLE):  # transitions 3 and 4 in one
+                after = DriveState.ENABLED
+            assert simulated.next_state(state, simulated.command(word, previous)) is after
 
 
 def test_supported_modes_are_bits_of_6502h():
