@@ -76,7 +76,7 @@ class SimulatedArm:
         self._address()
         self.supervision = Supervision(self.nodes, self.drives, self._apply)
         self._operational = self.supervision.operational
-        self._pdos = PdoTable(self._operational, self._send)
+        self._pdos = PdoTable(self._signals, self._operational, self._send)
         for node in self.nodes:
             joint = link.joints[node.place]
             node.device = device_of(joint, section.device)

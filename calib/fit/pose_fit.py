@@ -17,7 +17,7 @@ from calib.fit.gravity_fit import GravityFit
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import VERTICAL
 from gcomp.arrays import Array, Mask
-from gcomp.design.selection import select, sweep_information
+from gcomp.design.selection import select
 from gcomp.estimate.posterior import PartialModel, PosteriorFit, invert, most_probable
 from gcomp.estimate.problem import FREEDOM, EstimationProblem
 from gcomp.estimate.solve import robust_weight, scale_of
@@ -175,9 +175,10 @@ class PoseFit:
         columns = (columns.T / np.tile(noise, len(q))).T.reshape(CANDIDATES, -1, len(self.solution.x))
         unit = np.sqrt(np.diag(self.solution.covariance))
         own = self.solution.information * np.outer(unit, unit)
-        gained = sweep_information(columns * unit)
-        chosen = select([gained[None]], own[None], [count], exchanges=0)[0]
-        information = (own + gained[chosen].sum(axis=0)) / np.outer(unit, unit)
+        rows = columns * unit
+        chosen = select([rows[None]], own[None], [count], exchanges=0)[0]
+        best = rows[chosen].reshape(-1, len(unit))
+        information = (own + best.T @ best) / np.outer(unit, unit)
         after = replace(self, solution=replace(self.solution, information=information))
         return poses[chosen], after.bound(self.readings.position)
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.selection import select, sweep_information, sweep_jacobian
+from gcomp.design.selection import select, sweep_jacobian
 from gcomp.design.sweep_design import stop_combinations as limit_poses
 from gcomp.design.sweep_design import sufficient_levers
 from gcomp.gravity.torque import gravity_levers
@@ -62,11 +62,11 @@ def with_lever(candidates: Candidates) -> Candidates:
 
 @dataclass(frozen=True, eq=False)
 class StopDesign:
-    """Information on the unknowns that each joint's candidates give."""
+    """What each joint's candidates tell of the unknowns."""
 
     candidates: list[Candidates]
-    information: list[Array]
-    """JᵀJ (G, C, p, p) of each joint's candidates, for G guesses at the mass moments."""
+    rows: list[Array]
+    """Weighted Jacobian (G, C, K, p) of each joint's candidates, for G guesses at the mass moments."""
     prior: Array
     """(G, p, p) before any reading."""
 
@@ -78,12 +78,15 @@ class StopDesign:
         unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass."""
         flange, free = kinematics.span[-1], free_mask(kinematics.n, UNKNOWN)
         guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
-        information = [
-            np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses])
+        loads = (0.0, mass)
+        rows = [
+            np.stack(
+                [sweep_jacobian(kinematics, guess, each.joint, each.poses, sigma, free, loads) for guess in guesses]
+            )
             for each in candidates
         ]
         prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
-        return cls(candidates, information, prior)
+        return cls(candidates, rows, prior)
 
     def choose(self, counts: list[int], speed: Array) -> list[list[int]]:
         """For each joint's candidates, the indices of the `counts` combinations that together are best.
@@ -95,7 +98,7 @@ class StopDesign:
         def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
             return TRAVEL_COST * _seconds(self.candidates, chosen, place, slot, speed)
 
-        return select(self.information, self.prior, counts, cost=travel)
+        return select(self.rows, self.prior, counts, cost=travel)
 
 
 def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:
@@ -116,14 +119,6 @@ def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, 
         there = candidates[other].poses[chosen[other][number], 0]
         time += (np.abs(here.poses[:, 0] - there) / speed).max(axis=1)
     return time
-
-
-def _information(
-    kinematics: Arm, guess: Parameters, candidates: Candidates, sigma: Array, free: Mask, mass: float
-) -> Array:
-    return sweep_information(
-        sweep_jacobian(kinematics, guess, candidates.joint, candidates.poses, sigma, free, (0.0, mass))
-    )
 
 
 def _prior_std(guess: Parameters, sigma: Array) -> Array:

@@ -95,8 +95,7 @@ def _informative_poses(poses: Array, columns: Array, offset: float, limits: Driv
     joint's offset, in units of `offset` [N·m]."""
     offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
     rows = np.concatenate([columns, offsets], axis=2) / limits.rated[:, None]
-    information = np.einsum("kip,kiq->kpq", rows, rows)
-    (chosen,) = select([information[None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
+    (chosen,) = select([rows[None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
     return poses[chosen]
 
 

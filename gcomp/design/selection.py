@@ -22,7 +22,7 @@ Cost = Callable[[list[list[int]], int, int], Array]
 
 
 def select(
-    information: Sequence[Array],
+    rows: Sequence[Array],
     prior: Array,
     counts: Sequence[int],
     *,
@@ -33,33 +33,31 @@ def select(
 ) -> list[list[int]]:
     """Indices of the `counts` candidates of each group that together are best: a greedy selection, then exchanges.
 
-    `information` holds JᵀJ (G, C, p, p) of each group's candidates, for G guesses at the parameters over which the
-    criterion is averaged; `prior` (G, p, p) is the information without any candidate. `unit` (p,) is the natural unit
-    of each parameter, for the A criterion; `cost` is subtracted from the criterion. `exchanges` are the rounds in which
-    every selected candidate is compared once more with all others: more than two changed 4 of 28 designs (the paper's
-    arm and ten random ones, both criteria).
+    `rows` are the weighted Jacobians J (G, C, K, p) of each group's candidates, for G guesses at the parameters over
+    which the criterion is averaged; `prior` (G, p, p) is the information without any candidate, regular. `unit` (p,)
+    is the natural unit of each parameter, for the A criterion; `cost` is subtracted from the criterion. `exchanges`
+    are the rounds in which every selected candidate is compared once more with all others: more than two changed 4 of
+    28 designs (the paper's arm and ten random ones, both criteria).
     """
     total = prior.copy()
-    chosen: list[list[int]] = [[] for _ in information]
-    slots = [
-        (group, slot) for group, each in enumerate(information) for slot in range(min(counts[group], each.shape[1]))
-    ]
+    chosen: list[list[int]] = [[] for _ in rows]
+    slots = [(group, slot) for group, each in enumerate(rows) for slot in range(min(counts[group], each.shape[1]))]
     changes, seen = 0, dict[tuple[int, int], int]()
     for turn in range(1 + exchanges):
         for group, slot in slots:
-            each, picks = information[group], chosen[group]
+            each, picks = rows[group], chosen[group]
             if turn:
                 if seen[group, slot] == changes:  # compared with all others already, among the same selection
                     continue
-                total -= each[:, picks[slot]]
-            score = _score(total[:, None] + each, criterion, unit)
+                total -= _information(each[:, picks[slot]])
+            score = _gain(total, each, criterion, unit)
             if cost is not None:
                 score -= cost(chosen, group, slot)
             score[[pick for other, pick in enumerate(picks) if other != slot]] = -np.inf
             best = [int(np.argmax(score))]
             changes += picks[slot : slot + 1] != best
             seen[group, slot], picks[slot : slot + 1] = changes, best
-            total += each[:, picks[slot]]
+            total += _information(each[:, picks[slot]])
     return chosen
 
 
@@ -90,16 +88,21 @@ def sweep_jacobian(
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
 
 
-def sweep_information(jacobian: Array) -> Array:
-    """JᵀJ (C, p, p) of each candidate from a Jacobian (C, K, p)."""
-    information: Array = np.einsum("ckp,ckq->cpq", jacobian, jacobian, optimize=True)
-    return information
+def _information(rows: Array) -> Array:
+    """JᵀJ (G, p, p) of weighted Jacobians (G, K, p)."""
+    return np.asarray(rows.swapaxes(-1, -2) @ rows)
 
 
-def _score(total: Array, criterion: Criterion, unit: ArrayLike) -> Array:
-    """How good each candidate makes an information (G, C, p, p): (C,), larger is better."""
+def _gain(total: Array, rows: Array, criterion: Criterion, unit: ArrayLike) -> Array:
+    """How much better each candidate's rows (G, C, K, p) make the information `total` (G, p, p): (C,).
+
+    By the matrix determinant lemma and Woodbury's identity on the K readings of a candidate, which are fewer than the
+    parameters: I + J P Jᵀ, with the covariance P before it.
+    """
+    covariance = np.linalg.inv(total)
+    spread = rows @ covariance[:, None]
+    gram = spread @ rows.swapaxes(-1, -2) + np.eye(rows.shape[-2])
     if criterion == "D":
-        score: Array = np.linalg.slogdet(total)[1].mean(axis=0)
-        return score
-    variance = np.diagonal(np.linalg.inv(total), axis1=-2, axis2=-1)
-    return -np.asarray((variance / np.square(unit)).sum(axis=-1).mean(axis=0), dtype=np.float64)
+        return np.asarray(np.linalg.slogdet(gram)[1].mean(axis=0))
+    saved = (spread * np.linalg.solve(gram, spread)).sum(axis=-2) / np.square(unit)
+    return np.asarray(saved.sum(axis=-1).mean(axis=0))

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
-from gcomp.design.selection import Criterion, select, sweep_information, sweep_jacobian
+from gcomp.design.selection import Criterion, select, sweep_jacobian
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, predict_covariance
@@ -122,8 +122,8 @@ def choose_sweeps(
     """
     candidates = [candidate_sweeps(arm, joint, SKETCH_STEPS, margin) for joint in reversed(range(arm.n))]  # tip first
     judge = _Judge.of(arm, guess, [sweep for each in candidates for sweep in each], sigma, unknown, loads)
-    information = [sweep_information(judge.jacobian(each)) * (steps / SKETCH_STEPS) for each in candidates]
-    picks = judge.select(information, [poses] * arm.n, criterion)
+    rows = [judge.jacobian(each) * np.sqrt(steps / SKETCH_STEPS) for each in candidates]
+    picks = judge.select(rows, [poses] * arm.n, criterion)
     chosen = [each[pick] for each, of_joint in zip(candidates, picks, strict=True) for pick in of_joint]
     sweeps = [JointSweep(each.joint, each.pose, each.stepped(steps)) for each in chosen]
     return judge.design(sorted(sweeps, key=lambda sweep: sweep.joint))
@@ -161,10 +161,10 @@ class _Judge:
         poses = np.stack([sweep.positions() for sweep in sweeps])
         return sweep_jacobian(self.arm, self.guess, sweeps[0].joint, poses, self.sigma, self.free, self.loads)
 
-    def select(self, information: Sequence[Array], counts: Sequence[int], criterion: Criterion) -> list[list[int]]:
-        """The candidates of each group, given by their information (C, p, p), that together are best."""
+    def select(self, rows: Sequence[Array], counts: Sequence[int], criterion: Criterion) -> list[list[int]]:
+        """The candidates of each group, given by their weighted Jacobians (C, K, p), that together are best."""
         prior = np.diag(self.unit**-2.0)[None]
-        return select([each[None] for each in information], prior, counts, criterion=criterion, unit=self.unit)
+        return select([each[None] for each in rows], prior, counts, criterion=criterion, unit=self.unit)
 
     def design(self, sweeps: Sequence[JointSweep]) -> Design:
         readings = readings_of(self.arm, sweeps, self.sigma, self.loads)
