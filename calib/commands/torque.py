@@ -63,6 +63,7 @@ def _model(
     from armlink.errors import BadInput, Refused
     from calib.arm.stated_model import stated_model
     from calib.commands.options import gravity_model
+    from calib.commissioning.model_checks import mass_error
     from calib.records.store import RecordStore, way_to
 
     stated = stated_model(arm, base, tip, tool)
@@ -70,6 +71,9 @@ def _model(
     if arm_file is None and record is not None:
         raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
     if stated.beta is not None and record is None:
+        error = None if stated.placed is None else mass_error(str(stated.path), stated.placed.arm)
+        if error is not None:
+            raise BadInput(str(error))
         source = arm if arm_file is None or stated.path is None else stated.path.name
         return stated.arm, stated.beta, f"inertials of {source}"
     assert arm_file is not None  # a model file has inertials, and none has a record

@@ -74,7 +74,7 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
 def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Errors in masses or torque limits, each with its remedy; those that follow from another are left out."""
     model = None if arm_file.model_path is None else model_arm(arm_file)
-    impossible = None if model is None else _mass_error(arm_file, model)
+    impossible = None if model is None else mass_error(str(arm_file.model_path), model)
     if impossible is not None:
         yield impossible
         return
@@ -108,8 +108,9 @@ def _poses(arm: Arm) -> Array:
     return np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
 
 
-def _mass_error(arm_file: ArmFile, model: ModelArm) -> SetupFinding | None:
-    mass, where = float(model.mass.sum()), str(arm_file.model_path)
+def mass_error(where: str, model: ModelArm) -> SetupFinding | None:
+    """Masses of the model file `where` that are missing, or that no arm of its size has."""
+    mass = float(model.mass.sum())
     if mass < NO_MASS:
         return SetupFinding(
             "error",

@@ -183,7 +183,9 @@ def test_every_command_refuses_in_the_words_of_doctor(tmp_path: Path, capsys: py
     model.write_text(DrawnModel(1, massless=True)._text([50.0] * 9))
     arm, out = str(made.out), str(tmp_path / "out")
     error = next(found for found in examine(arm, offline=True) if found.level == "error")
+    (tmp_path / "poses.csv").write_text("q_1,q_2,q_3\n0,0,0\n")
     commands = [["sweep", arm, "--plan"], ["sweep", arm, "--dry-run", "--out", out], ["float", arm]]
+    commands.append(["torque", arm, "--q", str(tmp_path / "poses.csv")])
     for words in [*commands, ["demo", "--arm", arm, "--out", out]]:
         assert run(words) == 2
         assert capsys.readouterr().err.strip() == f"armlink: {error}"
