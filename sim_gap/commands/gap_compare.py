@@ -69,7 +69,7 @@ def compare(
     for model, finding in found.checks:
         out.print(f"{model}: {finding.sentence()}", style="yellow")
     if found.unit == "rad":
-        out.print("in brackets: the gap of a simulation that runs free")
+        out.print("in brackets: the gap of a free simulation along the commands")
     write_json(json, found.to_json())
     alike = ", ".join(each.model for each in found.models[1:] if each.alike)
     told = f"; these recordings do not show a difference from {alike}" if alike else ""
