@@ -67,7 +67,7 @@ def identify(
 ) -> int:
     """Identify the mass moments that gravity compensation needs, and store them as a gravity record.
 
-    From sweeps, or with --model from poses at rest or in slow motion of any robot, whatever it is connected by.
+    Without --model from sweeps; with --model from poses of any robot, recorded at rest or in slow motion.
     Exit status 1 if held-out poses are predicted worse than by the model's own inertials.
 
     Example: armlink identify poses.csv --model arm.urdf --out-model better.urdf

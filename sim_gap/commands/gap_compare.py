@@ -22,7 +22,7 @@ def compare(
     gains: KnownGain = "",
     json: Json = None,
 ) -> None:
-    """Rank models by the gap that they leave: running free and in windows, joint by joint, with intervals.
+    """Rank models by the gap that they leave: in free simulation and in windows, joint by joint, with intervals.
 
     Example: armlink gap compare --sim mine.xml --sim published.xml --heldout run.csv
     """
