@@ -113,7 +113,7 @@ def _gap(answer: Diagnosis) -> Section:
 def _motion(found: Identified, causes: Sequence[Cause]) -> list[Section]:
     figure = motion_figure(found, causes)
     text = (
-        "The command, the measured motion, and free simulations along the command, on held-out data. Click a "
+        "The command, the measured motion, and free-running simulations along the command, on held-out data. Click a "
         "name to hide or show its curve; “without” leaves one effect out of the corrected model."
     )
     return [] if figure is None else [Section("Motion of every joint", paragraph(text), [figure])]
