@@ -53,10 +53,10 @@ def check(
     what it will do to the joints and asks, except with --yes or on a simulated arm in this process. At the end the
     joints hold, in quick stop, or the arm is parked or lowered. Exit status 1 if a check fails.
 
-    With --host nothing is sent: this machine makes cycles at the rate of the arm while a job computes and writes. Exit
+    With --host nothing is sent: this machine makes cycles at the rate of the arm while another process computes. Exit
     status 1 if the machine is too slow for the deadline or the rate of the arm.
 
-    With --scales the readings are judged while the arm moves. Exit status 1 if a scale of a drive is wrong by a tenth.
+    With --scales the readings are judged while the arm moves. Exit status 1 if a scale is wrong by 10 % or more.
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
@@ -195,7 +195,7 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     from armlink.selftest.host import measure_host
 
     with console.status(
-        f"{arm.name}: running cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, together with a job"
+        f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, while another process computes"
     ):
         report = measure_host(arm, seconds)
     late, section = report.lateness.in_ms(), arm.require_link()

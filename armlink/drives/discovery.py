@@ -69,7 +69,7 @@ class BusDrives:
         found = {name: family(name).discovery for name in family_names()}
         ways = {name: way for name, way in found.items() if way is not None}
         self.parts: list[FoundDrives] = []
-        asked, others = list[str](), [f"{name} (found by the ids of an arm file alone)" for name in found.keys() - ways]
+        asked, others = list[str](), [f"{name} (found only by the ids in an arm file)" for name in found.keys() - ways]
         order = TopologicalSorter({name: way.spares for name, way in ways.items()}).static_order()
         for name in filter(ways.__contains__, order):
             way, lack = ways[name], ""

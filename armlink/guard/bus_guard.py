@@ -292,8 +292,8 @@ class Policy:
             )
         if not frame.after <= self._acknowledged:
             return (
-                f"the program sent {can_id:X}h, but the drive has not acknowledged the meaning of this frame since it "
-                "or the guard started: set up the arm again"
+                f"the program sent {can_id:X}h, but since the drive or the guard started, the drive has not "
+                "acknowledged the settings that give this frame its meaning: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:
@@ -453,7 +453,7 @@ class BusGuard:
         told = [self.wire.send(can_id, data) for can_id, data in self.policy.stop]
         then = "the joints were told to stop"
         if not all(told):
-            then = "the joints could not be told to stop, so they stop by their own watch of the bus"
+            then = "the joints could not be told to stop, so they stop when their drives notice the silence"
         self._say(f"guard: closed, it passes no more frames: {why}; {then}; start the guard again to open it")
 
 

@@ -144,8 +144,8 @@ def let_down(link: Parked, tell: Tell, why: str) -> None:
     for row in range(cycles(link, LONGEST_LOWERING)):
         if row % every == 0:
             tell(
-                f"the arm is being lowered, which takes {LONGEST_LOWERING - row * link.period:.0f} s at most, since "
-                f"it could not be parked: {why}"
+                "the arm could not be parked, so it is being lowered, which takes at most "
+                f"{LONGEST_LOWERING - row * link.period:.0f} s: {why}"
             )
         load = np.nan_to_num(np.array(link.commander.loop.latest_motor_torque))
         here = link.latest_position

@@ -26,7 +26,7 @@ def hold_afloat(
     yes: WithoutAsking = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Feed the gravity torque forward until Ctrl-C; then every joint holds where it is.
+    """Carry the arm's weight by torque, so that a hand can move it, until Ctrl-C; then every joint holds where it is.
 
     Stops have soft ends; no frame exceeds the arm file's limits. Keep a hand on the arm the first time.
 

@@ -20,7 +20,7 @@ POSES = "Poses of any robot, with --model"
 def identify(
     data: Annotated[
         list[Path],
-        typer.Argument(help="Data sets of sweep; with --model recordings or tables of poses: CSV, bag, LeRobot."),
+        typer.Argument(help="Data sets of sweep; or, with --model, recordings or tables of poses (CSV, bag, LeRobot)."),
     ],
     stated: "Corrections",
     arm: SweepsArm = None,
@@ -43,13 +43,13 @@ def identify(
     ] = None,
     heldout: Annotated[
         list[Path] | None,
-        typer.Option(help="Poses to judge by; by default cross-validation.", rich_help_panel=POSES),
+        typer.Option(help="Poses on which the result is judged; by default cross-validation.", rich_help_panel=POSES),
     ] = None,
     gain_std: Annotated[
         float | None,
         typer.Option(
             min=0.0,
-            help="Standard deviation of the torque gains about 1; by default 0.03 of sensors, 0.5 of motor currents.",
+            help="Standard deviation of torque gains from 1; by default 0.03 for sensors, 0.5 for motor currents.",
             rich_help_panel=POSES,
         ),
     ] = None,
@@ -67,7 +67,7 @@ def identify(
 ) -> int:
     """Identify the mass moments that gravity compensation needs, and store them as a gravity record.
 
-    From sweeps, or with --model from poses at rest or in slow motion of any robot, whatever it is connected by.
+    Without --model from sweeps; with --model from poses of any robot, recorded at rest or in slow motion.
     Exit status 1 if held-out poses are predicted worse than by the model's own inertials.
 
     Example: armlink identify poses.csv --model arm.urdf --out-model better.urdf

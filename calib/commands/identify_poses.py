@@ -134,7 +134,7 @@ def identify_poses(
         out.print(f"record {record} is current")
     if out_model is not None and described.placed is not None and described.path is not None:
         write_model(described.placed, described.path, fit.gravity.beta, out_model)
-        out.print(f"{out_model}: the model with these mass moments, in bodies that can exist")
+        out.print(f"{out_model}: the model with these mass moments, in physically possible bodies")
     if options.coefficients is not None:
         write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, options.coefficients)
         out.print(f"{options.coefficients}: base parameters, and the names of the regressor's columns")
@@ -221,6 +221,6 @@ def _show_plan(judged: Judged, poses: Array, bound: Array, console: "PlainConsol
     console.print(table)
     after = ", ".join(f"{name} {value:.2g}" for name, value in zip(judged.fit.arm.names, bound, strict=True))
     console.print(
-        f"read from both sides, they bring the bound of gravity's RMS error to [N·m]: {after}. The poses are within "
-        "the joint limits; nothing has checked them for collisions"
+        "if these poses are approached and read from both sides, the bound of gravity's RMS error becomes [N·m]: "
+        f"{after}. The poses are within the joint limits; they were not checked for collisions"
     )

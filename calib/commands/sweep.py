@@ -153,7 +153,7 @@ def _plan(
         planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
         took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
-        before = f"{_minutes(stops_seconds(arm_file))} more for pushing the stops before the first pass"
+        before = f"{_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
         told = f"about {_minutes(took)} for each pass, {before}; {checked}{drawn}"
     print_plan(arm_file, planned, console)
     if picture is not None:

@@ -265,12 +265,10 @@ def arm_text(draft: Draft, out: Path) -> str:
         lines.append("  locked:  # joints that these drives do not move [rad, m]")
         lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
     lines.append(
-        yaml_entry(
-            "gravity", list(draft.gravity), 2, "m/s² in the model's frame; assumed: the arm stands as in the model"
-        )
+        yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame; assumed: mounted as in the model")
     )
     lines += [
-        yaml_comment(f"joint {name} {why}: not part of the arm, it stays at its position in the model", 2)
+        yaml_comment(f"joint {name} {why}, so it is not part of the arm and stays at its position in the model", 2)
         for name, why in draft.aside
         if name not in draft.locked
     ]

@@ -155,7 +155,7 @@ def _rate(row: Any, match: Match, notes: list[str]) -> list[SetupFinding]:
         what, doubtful = f"has a torque field that ends at {rated:g} N·m", rated < before
         notes += ["rated_torque assumed: the end of the drive's torque field"] * doubtful
     by_hand = "" if match.by_hand else " (--by-hand finds the drive of each joint)"
-    what = f"the drive {what}, but the joint was to have a rated torque of {before:g} N·m"
+    what = f"the drive {what}, but by the model the joint needs a rated torque of {before:g} N·m"
     where, remedy = f"{match.joint} ({drive.address})", f"check that this drive moves this joint{by_hand}"
     return [SetupFinding("warning", what, where, remedy)] if doubtful else []
 

@@ -236,8 +236,8 @@ def _refuse_payload(problem: FieldProblem, noise: Array, chi2: float) -> None:
     as_installed = problem.solve(base, noise).chi2
     if as_installed > as_load + VERY_STRONG_EVIDENCE and mass > 0 and as_load < as_new + VERY_STRONG_EVIDENCE:
         raise Refused(
-            f"a payload of {mass:.2f} kg explains these readings as well as other gains do: if there is a "
-            "payload, take it off and record again; if there is none, sweep with a reference mass"
+            f"two causes would explain these readings equally well: a payload of {mass:.2f} kg, or changed gains. If "
+            "there is a payload, take it off and record again; if there is none, sweep with a reference mass"
         )
 
 

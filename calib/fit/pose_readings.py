@@ -93,7 +93,7 @@ def load_poses(
     `masses`: path → reference mass that hung at the tip [kg]. Raises BadInput.
     """
     if stated is not None and stated.without_gravity:
-        raise BadInput("--effort-is without-gravity: gravity was taken off these efforts, and they do not tell it")
+        raise BadInput("--effort-is without-gravity: the efforts do not contain gravity, so they show no masses")
     parts, sources, channel = list[StaticReadings](), dict[str, str](), ""
     for path in paths:
         for label, loaded in load_recordings(path, stated, poses=True).items():
@@ -101,8 +101,8 @@ def load_poses(
             found = channel_of(recording, label)
             if channel and found != channel:
                 raise BadInput(
-                    f"{label}: torque is in {COLUMNS[found]}_1 …, but in {next(iter(sources))} in "
-                    f"{COLUMNS[channel]}_1 …: a joint's gain and friction are those of one channel"
+                    f"{label} has torque in {COLUMNS[found]}_1 …, but {next(iter(sources))} has torque in "
+                    f"{COLUMNS[channel]}_1 …: give files with one of them, since each has its own gain and friction"
                 )
             channel = found
             parts.append(pose_readings(recording, channel, model, len(parts), masses.get(str(path), 0.0), label))

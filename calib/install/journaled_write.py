@@ -66,7 +66,7 @@ def _require_shared(arm: ArmFile, drives: Sequence[str], known: Sequence[str], w
     if here and there and not {*here} & {*there}:
         raise Refused(
             f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of the drives {what} "
-            f"({there[0]} …), so another arm has the same name and serial, and nothing was written: give "
+            f"({there[0]} …). Another arm has the same name and serial, so nothing was written: give "
             f"each arm a serial of its own in its arm file ({arm.path.name}) and calibrate it"
         )
 
@@ -138,7 +138,7 @@ def recover(arm: ArmFile, store: RecordStore, controllers: Controllers) -> Contr
             _restore(controllers, entry, store=False)
         else:
             strangers.append(str(entry["name"]))
-    left = f"; {', '.join(strangers)} got another calibration since and was left as it is" if strangers else ""
+    left = f"; {', '.join(strangers)} got another calibration since then, which was not changed" if strangers else ""
     store.undo_write(line, arm, f"the write was cut off before it ended{left}")
     return line
 

@@ -117,9 +117,9 @@ def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(
-                f"{name}: of its range {limits.lower[joint]:g} to {limits.upper[joint]:g} rad, {last - first:.2f} rad "
-                f"are left to sweep after range_margin ({section.range_margin:g} rad) and 2 % at each end, at least "
-                "0.2 rad are needed: check lower and upper, or reduce range_margin"
+                f"{name}: of its range {limits.lower[joint]:g} to {limits.upper[joint]:g} rad only {last - first:.2f} "
+                "rad are left to sweep, at least 0.2 rad are needed. At each end range_margin "
+                f"({section.range_margin:g} rad) and 2 % are left out: check lower and upper, or reduce range_margin"
             )
 
 

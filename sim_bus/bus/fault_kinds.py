@@ -20,7 +20,7 @@ KINDS = {
         FaultKind("bus.off", False, "restart time [s]", 0.1, "the host's controller is bus-off and then restarts"),
         FaultKind("bus.full", False, "duration [s]", math.inf, "nobody acknowledges: the transmit queue stays full"),
         FaultKind("link.down", False, "duration [s]", math.inf, "the interface is down"),
-        FaultKind("reader.slow", False, "frames", 4.0, "the host's receive queue holds only so many frames"),
+        FaultKind("reader.slow", False, "frames", 4.0, "the host's receive queue holds only this number of frames"),
         FaultKind("frame.short", True, "share of frames", 1.0, "position and torque come in frames of three bytes"),
         FaultKind("frame.corrupt", True, "share of frames", 1.0, "the node's frames are destroyed by error frames"),
         FaultKind("emcy.storm", True, "frames/s", 1000.0, "the node sends emergency 7305h again and again"),

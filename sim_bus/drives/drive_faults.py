@@ -21,12 +21,12 @@ DRIVE_KINDS = {
     kind.id: kind
     for kind in (
         FaultKind("drive.trip", True, "", 0.0, "the drive's watchdog trips although its host is there"),
-        FaultKind("drive.latched", True, "", 0.0, "the same, and nothing but a power cycle clears it"),
-        FaultKind("drive.mode", True, "mode", 2.0, "the drive finds itself in this mode of control"),
+        FaultKind("drive.latched", True, "", 0.0, "the drive's watchdog trips, and only a power cycle clears it"),
+        FaultKind("drive.mode", True, "mode", 2.0, "the drive changes to this mode of control"),
         FaultKind("drive.classic", True, "", 0.0, "the drive answers CAN FD frames by classical ones"),
-        FaultKind("scale.position", True, "factor", 1.25, "positions are coded by a range this much larger than told"),
-        FaultKind("scale.velocity", True, "factor", 1.25, "velocities are coded by a range this much larger than told"),
-        FaultKind("scale.torque", True, "factor", 1.25, "torques are coded by a range this much larger than told"),
+        FaultKind("scale.position", True, "factor", 1.25, "positions are coded with a range larger than reported"),
+        FaultKind("scale.velocity", True, "factor", 1.25, "velocities are coded with a range larger than reported"),
+        FaultKind("scale.torque", True, "factor", 1.25, "torques are coded with a range larger than reported"),
         FaultKind("feedback.lost", True, "", math.inf, "the drive has lost its encoder, or sends no feedback"),
         FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted and does nothing"),
     )
@@ -42,8 +42,8 @@ SECOND_SENDER = ("forged", "doubled")
 def _kind(how: str, quantity: str) -> FaultKind:
     unit = UNITS[quantity]
     value, default, does = {
-        "frozen": ("", 0.0, f"the {quantity} that is told stays what it is"),
-        "scaled": ("factor", 2.0, f"the {quantity} that is told is this many times the true one"),
+        "frozen": ("", 0.0, f"the reported {quantity} no longer changes"),
+        "scaled": ("factor", 2.0, f"the reported {quantity} is the true one times this factor"),
         "forged": (f"{quantity} [{unit}]", 0.0, f"a second node repeats the joint's frames with this {quantity}"),
         "doubled": ("", 0.0, f"a second node repeats the joint's frames with the {quantity} that they had at first"),
     }[how]

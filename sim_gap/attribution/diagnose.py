@@ -52,7 +52,7 @@ from sim_gap.search.term_equations import TermChoice
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
-LENT = "since no training recording shows the body that it carries or lacks, and the first half was used for the fit"
+LENT = "the first half was used for the fit, since no training recording has the same load at the tip"
 """Why half of a held-out recording is fitted."""
 
 
@@ -132,7 +132,7 @@ def diagnose(
         if body_of(again) is not None:
             search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
             heldout_is += (
-                f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half is held out, {LENT}"
+                f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half is held out: {LENT}"
             )
     fit = estimate.store.data
     within = not fit.impacts and is_within(judge) and is_within(fit)

@@ -156,8 +156,8 @@ def _turned(sets: Sequence[ResidualSet]) -> list[str]:
 
 def _alike(found: Sequence[Cause]) -> tuple[str, ...]:
     return tuple(
-        f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may not be "
-        "in the library"
+        f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may be "
+        "unknown to armlink"
         for cause in found
         if cause.signs.outside < AS_GOOD
     )
@@ -211,6 +211,6 @@ def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, .
         f"{names[law.joint]}: the remaining gap in {law.channel} depends on the joint's {law.quantity}"
         + (", directed against the motion" if law.directed else "")
         + f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); "
-        "no effect of the library explains it"
+        "no known effect explains it"
         for law in laws
     )

@@ -73,8 +73,8 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
     if rollout.worse:
         before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
         out.append(
-            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal model "
-            f"({before:.3g} rad): "
+            "in a free-running simulation, the corrected model leaves a larger gap "
+            f"({after:.3g} rad) than the nominal model ({before:.3g} rad): "
             + ("do not train with the corrected model, and record other motion" if gap else "use the nominal model")
         )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
@@ -82,7 +82,7 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
         f"{found.sim.arm.names[j]} {left[j]:.3g} rad (fit {found.heldout_after[j]:.3g})"
         for j in np.flatnonzero(left > FAR * least)
     ]
-    told = "running free in MuJoCo along the held-out commands, the corrected model leaves a larger gap than the fit"
+    told = "in a free-running simulation of the held-out motion, the corrected model leaves a larger gap than the fit"
     return [*out, f"{told}: {', '.join(far)}"] if far else out
 
 

@@ -36,7 +36,7 @@ SEPARATING_MOTION = {
     frozenset({"friction.coulomb", "friction.viscous"}): "record constant speeds from slow to fast, in both directions",
     frozenset(
         {"friction.asymmetric", "torque.offset"}
-    ): "record a rest under a known load, and both directions at several loads",
+    ): "record a rest under a known load, and motion in both directions under several loads",
     frozenset({"actuator.gain", "link.mass_moment"}): "record the same poses with a known payload attached",
     frozenset({"torque.gain", "link.payload"}): "record the same poses with and without the payload",
     frozenset({"torque.gain", "link.mass_moment"}): "record the same poses with a known payload attached",

@@ -124,7 +124,7 @@ def _given(fields: Mapping[str, str], row: Row) -> str:
     return ", ".join(f"{name}={value:.6g}" for name, value in values.items() if value is not None)
 
 
-ABOUT = "Controllers are the asset's own: these recordings say what torques do."
+ABOUT = "The controllers stay those of the asset, since these recordings show torques and no controller."
 IN_ENTRY = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia", "actuator.delay", "actuator.saturation")
 LINKS = ("link.", "base.")
 """Effects whose names begin so are of links, which the corrected model has."""

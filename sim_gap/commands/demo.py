@@ -28,7 +28,7 @@ def demo(
         Path | None, typer.Option(help="Also write the summary as JSON to this file; for standard output give `-`.")
     ] = None,
 ) -> None:
-    """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
+    """Run the whole procedure on a simulated arm on an in-process CAN bus and write report.html and summary.json.
 
     For a model (armlink demo --arm my-arm.urdf), an arm file is made first in the folder, as armlink new makes it.
 

@@ -32,7 +32,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
 ) -> None:
-    """Make sealed cases, diagnose them, then open the labels and score (label withheld and effect withheld).
+    """Make sealed cases, diagnose them with the true effect known and with it unknown, open the labels and score.
 
     Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
 

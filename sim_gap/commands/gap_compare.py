@@ -22,7 +22,7 @@ def compare(
     gains: KnownGain = "",
     json: Json = None,
 ) -> None:
-    """Rank models by the gap that they leave: running free and in windows, joint by joint, with intervals.
+    """Rank models by the gap that they leave: free-running and in windows, joint by joint, with intervals.
 
     Example: armlink gap compare --sim mine.xml --sim published.xml --heldout run.csv
     """
@@ -69,7 +69,7 @@ def compare(
     for model, finding in found.checks:
         out.print(f"{model}: {finding.sentence()}", style="yellow")
     if found.unit == "rad":
-        out.print("in brackets: the gap of a simulation that runs free")
+        out.print("in brackets: the gap of a free-running simulation along the commands")
     write_json(json, found.to_json())
     alike = ", ".join(each.model for each in found.models[1:] if each.alike)
     told = f"; these recordings do not show a difference from {alike}" if alike else ""

@@ -147,7 +147,7 @@ LAWS = {law.id: law for law in _LAWS}
 
 FAMILIES = (friction, link, base, position, torque, transmission, drive)
 """Modules with an `EFFECTS`; effects are searched in this order."""
-NOT_DIAGNOSED = {"torque.nonlinearity": "noted as the general law `law.load`, which is not attributed"}
+NOT_DIAGNOSED = {"torque.nonlinearity": "reported only as the general law `law.load`, never as a cause"}
 """Catalogue ids without an inverse form, and why."""
 _LIBRARY: dict[str, InverseEffect] = {each.id: each for family in FAMILIES for each in family.EFFECTS}
 _EFFECTS = _LIBRARY | {law.id: law.effect for law in LAWS.values()}

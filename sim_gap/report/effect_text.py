@@ -28,7 +28,7 @@ def sentence(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained" and answer.unexplained < 0.01 and answer.notes:
         return f"Gap not explained: {answer.notes[0]}"
     if answer.verdict == "unexplained":
-        return f"Gap not explained: no effect of the library accounts for {answer.unexplained:.0%} of it"
+        return f"Gap not explained: {answer.unexplained:.0%} of it has no known cause"
     if answer.doubts:
         columns = " and ".join(dict.fromkeys(f"{each.channel} of {each.joint}" for each in answer.doubts))
         return f"Cause ambiguous: it depends on what {columns} really contain, which is in doubt"

@@ -113,7 +113,7 @@ def _gap(answer: Diagnosis) -> Section:
 def _motion(found: Identified, causes: Sequence[Cause]) -> list[Section]:
     figure = motion_figure(found, causes)
     text = (
-        "The command, the measured motion, and simulations that run free along the command, on held-out data. Click a "
+        "The command, the measured motion, and free-running simulations along the command, on held-out data. Click a "
         "name to hide or show its curve; “without” leaves one effect out of the corrected model."
     )
     return [] if figure is None else [Section("Motion of every joint", paragraph(text), [figure])]
@@ -153,11 +153,11 @@ def _laws(answer: Diagnosis) -> list[Section]:
     if not answer.laws:
         return []
     text = (
-        "Here the part of the torque that the effects of the library do not explain follows one quantity of "
+        "Here the part of the torque that no known effect explains follows one quantity of "
         "the joint. The law was fitted to the training data; grey points are held-out data. The law says "
         "how the torque varies, not why."
     )
-    return [Section("Laws outside the library", paragraph(text), [law_figure(answer, law) for law in answer.laws])]
+    return [Section("Laws without a known cause", paragraph(text), [law_figure(answer, law) for law in answer.laws])]
 
 
 def _residuals(answer: Diagnosis) -> list[Section]:

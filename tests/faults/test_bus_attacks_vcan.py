@@ -11,7 +11,7 @@ from bus_attacks import BARE, GUARDED, Scene, link, scene
 
 pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py`
 
-OWN_WATCHES = "the joints could not be told to stop, so they stop by their own watch of the bus"
+OWN_WATCHES = "the joints could not be told to stop, so they stop when their drives notice the silence"
 CLOSED = {
     "killed": "",
     "command on the wire": "20Bh came on the wire and is not from this guard: another host commands the drives there",

@@ -360,7 +360,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
         models = [name for name, usual in MODELS.items() if np.allclose(ranges, usual, rtol=1e-3)]
         alike = [each for each in replies if (replies[each], each & 0xF) == (reply, drive & 0xF) and each != drive]
         lack = "the value as delivered" if reply == 0 else ""
-        lack = f"and cannot be told from those of id {alike[0]:02X}h" if alike else lack
+        lack = f"and cannot be distinguished from those of id {alike[0]:02X}h" if alike else lack
         lack = f"on which id {commands[reply]:02X}h takes commands" if reply in commands else lack
         wrong = f"answers come on {reply:02X}h, {lack}: set another reply id in it (register 7)" if lack else ""
         keys = {"id": drive, "reply": reply, "model": (*models, "")[0], "kp": 0.0, "kd": 0.0}

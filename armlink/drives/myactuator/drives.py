@@ -65,8 +65,8 @@ class MyActuatorSettings(DriveSettings):
         usual = frames.torque_constant(self.model) if self.model in frames.RATINGS else 0.0
         if self.torque_constant is not None and self.torque_constant < usual / math.sqrt(LEAST_GEAR):
             raise ValueError(
-                f"torque_constant {self.torque_constant:g} is that of the motor before the gear, by the ratings of an "
-                f"{self.model} ({usual:.3g} N·m/A at the output): currents would be too large"
+                f"torque_constant {self.torque_constant:g} is that of the motor before the gear, so currents would be "
+                f"too large: give the one at the output, which is {usual:.3g} N·m/A by the ratings of an {self.model}"
             )
         return self
 
@@ -178,12 +178,12 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         self.memory[joint] = MyActuatorMemory(limits, None, position, 0.0, on=False, error=told[1])
         self.powers[joint] = Power.FAULT if told[1] else Power.OFF
         self.faults[joint] = frames.error_text(told[1])
-        notes = [_watched(settings), "the torque constant is taken from the arm file, since the drive tells none"]
+        notes = [_watched(settings), "the torque constant is taken from the arm file, since the drive reports none"]
         planned = self._ask(ask, joint, RmdCommand.ACCELERATION, frames.unpack_count)
         if planned:
             notes.append(
-                f"it plans its own way to each position target, with {planned} °/s²: set acceleration and deceleration "
-                "of its position loop to 0, so that it follows targets as they come"
+                f"it plans its own path to each position target, with {planned} °/s²: set acceleration and "
+                "deceleration of its position loop to 0, so that it follows every target directly"
             )
         return Setup(
             position=position,
@@ -356,7 +356,7 @@ def _watched(settings: MyActuatorSettings) -> str:
     store = frames.timeout_command(100).hex().upper()
     return (
         "`timeout_ms` is not given in the `drive:` section: the drive keeps on with its last command after its host "
-        f"died; store a time-out in it once, 100 ms by the frame {COMMAND_ID + settings.id:03X}#{store}, and state it"
+        f"died; store a time-out in it once (100 ms: frame {COMMAND_ID + settings.id:03X}#{store}), and state it there"
     )
 
 

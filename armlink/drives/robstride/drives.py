@@ -61,7 +61,7 @@ class RobStrideSettings(DriveSettings):
     def _gains_fit_the_model(self) -> "RobStrideSettings":
         ranges = RANGES[self.model]
         if self.kp > ranges.kp or self.kd > ranges.kd:
-            raise ValueError(f"kp {self.kp} and kd {self.kd}: {self.model} takes kp to {ranges.kp}, kd to {ranges.kd}")
+            raise ValueError(f"kp {self.kp}, kd {self.kd}: {self.model} has kp up to {ranges.kp}, kd up to {ranges.kd}")
         return self
 
     @property

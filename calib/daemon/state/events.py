@@ -187,7 +187,7 @@ def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
     if cause in ("payload", "tool"):
         return "payload", f"{_load(cause, evidence)}; {sure}", evidence
     if cause == "ambiguous":
-        return "undecided", f"the cause is still ambiguous: {', '.join(evidence['rivals'])}; {sure}", evidence
+        return "undecided", f"the cause is still ambiguous ({' or '.join(evidence['rivals'])}); {sure}", evidence
     if cause == "unknown":
         return (
             "contact",

@@ -751,7 +751,7 @@ def test_a_stop_that_did_not_leave_is_not_told_as_one():
     wire.full = True
     guard.close("the guard was told to end")
     (line,) = lines
-    assert "the joints could not be told to stop, so they stop by their own watch of the bus" in line
+    assert "the joints could not be told to stop, so they stop when their drives notice the silence" in line
 
 
 def test_a_program_that_takes_no_frames_keeps_none_to_the_wire_waiting(wires, monkeypatch, tmp_path):

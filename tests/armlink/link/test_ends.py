@@ -194,7 +194,7 @@ def test_an_error_of_the_way_to_park_lets_the_arm_down(monkeypatch, caplog):
     with caplog.at_level(logging.INFO, "armlink"):
         bench.leave(None)
     assert (
-        "the arm is being lowered, which takes 3 s at most, since it could not be parked: MemoryError: a "
+        "the arm could not be parked, so it is being lowered, which takes at most 3 s: MemoryError: a "
         "way that is too long"
     ) in caplog.text
     assert (bench.peak < 0.1 + EXTRA_SPEED).all(), bench.peak
@@ -247,7 +247,7 @@ def test_a_pendulum_without_a_pose_is_let_down_to_where_it_hangs(caplog):
         after_each_step(sim.plant, look)
     assert re.search(
         (
-            r"the arm is being lowered, which takes \d+ s at most, since it could not be parked: the arm "
+            r"the arm could not be parked, so it is being lowered, which takes at most \d+ s: the arm "
             r"file has no link\.park"
         ),
         caplog.text,
@@ -269,7 +269,7 @@ def test_an_arm_without_a_pose_is_let_down_slowly(caplog):
         bench.leave(None)
     assert re.search(
         (
-            r"the arm is being lowered, which takes \d+ s at most, since it could not be parked: the arm "
+            r"the arm could not be parked, so it is being lowered, which takes at most \d+ s: the arm "
             r"file has no link\.park"
         ),
         caplog.text,

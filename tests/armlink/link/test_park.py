@@ -72,7 +72,7 @@ def test_a_joint_that_is_blocked_on_the_way_holds(caplog, monkeypatch):
         with pytest.raises(Refused, match=r"park: shoulder is at .* stopped following its target .* all joints hold"):
             link.park()
         assert link.enabled
-    assert "the arm is being lowered" in caplog.text
+    assert "so it is being lowered" in caplog.text
 
 
 def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog, monkeypatch):
@@ -84,7 +84,7 @@ def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog, monkeypatch):
         with pytest.raises(BadInput, match=r"key `link\.park` is missing"):
             link.park()
     assert (
-        "the arm is being lowered, which takes 3 s at most, since it could not be parked: the arm file has no link.park"
+        "the arm could not be parked, so it is being lowered, which takes at most 3 s: the arm file has no link.park"
     ) in caplog.text
 
 

@@ -172,7 +172,7 @@ def test_the_models_own_moments_are_those_with_the_tool_of_the_arm_file(bench):
         ("poses.csv --model arm.xml --out-model x.obj", ".urdf or .xml"),
         ("poses.csv --model arm.xml --out-model /none/x.xml", "/none"),
         ("poses.csv --model sarcos --out-model x.urdf", "--out-model"),
-        ("poses.csv --model arm.xml --effort-is without-gravity", "gravity was taken off"),
+        ("poses.csv --model arm.xml --effort-is without-gravity", "the efforts do not contain gravity"),
         ("poses.csv --model arm.xml --arm sarcos", "only for sweeps"),
         ("poses.csv --plan 3", "--plan: only for poses"),
         ("poses.csv --gain-std 0", "--gain-std: only for poses"),

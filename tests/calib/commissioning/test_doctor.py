@@ -93,7 +93,7 @@ def test_a_sound_arm_has_no_error(tmp_path):
         (("link", "joints", 0, "rated_torque"), "40 Nm", "error", ["link.joints.0.rated_torque", "without 'Nm'"]),
         (("kinematics", "gravity"), [0, 0, -9.81], "error", ["kinematics.gravity", "gravity loads no joint"]),
         (("kinematics", "gravity"), [0, -1.6, 0], "warning", ["kinematics.gravity", "1.6"]),
-        (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "are left to sweep after range_margin"]),
+        (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "left to sweep, at least 0.2 rad"]),
         (("serial",), "FILL-IN", "hint", ["serial is FILL-IN", "serial: …"]),
         (("link", "joints", 0, "max_torque"), 400.0, "warning", ["shoulder", "three times"]),
         (("link", "joints", 0, "max_torque_rate"), 9000.0, "hint", ["shoulder", "usual"]),

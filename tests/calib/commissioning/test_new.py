@@ -291,7 +291,9 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     made.write()
     assert cli.run(["new", "arm4.yaml", "--force", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
     assert [joint.settings for joint in load_arm("arm4.yaml").require_link().joints] == drives
-    assert "kp, kd assumed: the torque range over one radian, damped as armlink doctor asks" in comments("arm4.yaml")
+    assert "kp, kd assumed: the torque range per radian, and the damping that armlink doctor asks for" in comments(
+        "arm4.yaml"
+    )
     (tmp_path / "old.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "old.yaml", "--out", "mine.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
     first = load_arm("mine.yaml").require_link().joints[0].settings
@@ -314,7 +316,7 @@ def test_a_rating_beyond_the_torque_field_of_the_drive_is_cut_and_said(made, tmp
     assert cli.run(["new", "arm4.urdf", "--bus", "armlink_sim:real.yaml"]) == 0
     said = capsys.readouterr().out
     for joint, torque in (("j1 (id 01h)", 40), ("j2 (id 02h)", 40), ("j3 (id 03h)", 20)):
-        what = "the drive has a torque field that ends at 10 N·m, but the joint was to have a rated torque of"
+        what = "the drive has a torque field that ends at 10 N·m, but by the model the joint needs a rated torque of"
         assert f"{joint}: {what} {torque} N·m" in said
     assert "j4 (id 04h): the drive" not in said
     joints = load_arm("arm4.yaml").require_link().joints

@@ -61,8 +61,7 @@ def test_an_arm_that_shares_name_and_serial_with_one_written_before_is_refused(s
     for new in (NEW, record()):
         with pytest.raises(
             Refused,
-            match="another arm has the same name and serial, and nothing was written: give each arm a serial "
-            "of its own",
+            match="Another arm has the same name and serial, so nothing was written: give each arm a serial of its own",
         ):
             write(store, other, new)
     assert other.held == Controllers().held
@@ -170,7 +169,7 @@ def test_of_two_arms_of_one_name_on_one_store_none_gets_the_other_s_calibration(
         found.append(len(one.of_kind("recalibration")))
         if not found[-1]:
             assert one.held() == held
-            said = {"unknown": "its serial is unknown", "7": "another arm has the same name and serial"}[serial]
+            said = {"unknown": "its serial is unknown", "7": "Another arm has the same name and serial"}[serial]
             assert said in one.of_kind("refused")[-1].text
             assert one.view.status().state is State.OBSERVING
     assert found == written

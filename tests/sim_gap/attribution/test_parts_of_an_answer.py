@@ -146,5 +146,6 @@ def test_a_written_model_that_leaves_more_than_the_nominal_one_is_said() -> None
     assert note.endswith("use the nominal model")
     (note,) = running_free(found, worse, gap=True)
     assert note.startswith(
-        "running free, the corrected model leaves a larger gap (0.0381 rad) than the nominal model (0.03 rad)"
+        "in a free-running simulation, the corrected model leaves a larger gap (0.0381 rad) than the nominal model "
+        "(0.03 rad)"
     )
