@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from referee import page
-from referee.rounds import play
+from referee.rounds import play, pooled
 
 
 def main() -> int:
@@ -31,6 +31,7 @@ def main() -> int:
     for seed in options.seed:
         shutil.rmtree(options.out / str(seed), ignore_errors=True)
     rounds = [play(options, seed) for seed in options.seed]
+    rounds = [pooled(rounds), *rounds] if len(rounds) > 1 else rounds
     (options.out / "table.md").write_text(page.markdown(rounds), encoding="utf-8")
     (options.out / "referee.svg").write_text(page.svg(rounds[0]), encoding="utf-8")
     if options.page:

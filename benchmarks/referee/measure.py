@@ -59,8 +59,11 @@ def _at(clock: Any, t: Any, values: Any) -> Any:
 
 
 def errors(xml: str, joints: tuple[str, ...], kind: str, recording: dict[str, Any]) -> dict[str, float]:
-    """Residual and roll-out of a model. Raises ValueError if MuJoCo does not take it or a joint is missing."""
+    """Residual and roll-out of a model. Raises ValueError if MuJoCo does not take it, a joint is missing, or the
+    recording is shorter than three windows."""
     model, seen = mujoco.MjModel.from_xml_string(xml), even(recording)
+    if len(seen.q) * STEP_S < 2.0 * SETTLING_S + 3.0 * POSITION_WINDOW_S:
+        raise ValueError("the recording is too short")
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in joints]
     if min(ids) < 0:
         raise ValueError(f"the model lacks the joint {joints[ids.index(-1)]}")

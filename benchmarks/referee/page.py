@@ -16,16 +16,26 @@ LEAST_LOG = 0.02
 
 
 def markdown(rounds: Sequence[Mapping[str, Any]]) -> str:
-    """The rounds, each with its table, what is decided, and what is not offered."""
-    return "\n\n".join(_round(made) for made in rounds) + "\n"
+    """The rounds, each with its table, what is decided, and what is not offered; then whether rounds contradict."""
+    text = "\n\n".join(_round(made) for made in rounds) + "\n"
+    return text + (f"\n{_contradictions(rounds)}\n" if len(rounds) > 1 else "")
+
+
+def _contradictions(rounds: Sequence[Mapping[str, Any]]) -> str:
+    """Pairs that one round decides one way, and another round the other way."""
+    decided = {(d["score"], d["better"], d["worse"]) for made in rounds for d in made["summary"]["decided"]}
+    both = sorted((key, a, b) for key, a, b in decided if a < b and (key, b, a) in decided)
+    text = "; ".join(f"{key}: {a} and {b}" for key, a, b in both)
+    return f"Decided one way in one round and the other way in another: {text or 'nothing'}."
 
 
 def _round(made: Mapping[str, Any]) -> str:
     found, tools = made["summary"], made["summary"]["tools"]
     lines = [
-        f"### Seed {made['seed']}: {made['cases']} cases, {made['date']}",
-        f"At most {made['cpu_seconds']:.0f} s of a core for a tool and case. Sealed labels: SHA-256 of their hashes"
-        f" `{made['sealed'][:16]}`.",
+        f"### {_title(made)}",
+        f"At most {made['cpu_seconds']:.0f} s of a core for a tool and case. Sealed labels: SHA-256 of their hashes "
+        + ", ".join(f"`{digest[:16]}`" for digest in made["sealed"])
+        + ".",
         "",
         "| score | " + " | ".join(tools) + " |",
         "|---|" + "---|" * len(tools),
@@ -41,6 +51,11 @@ def _round(made: Mapping[str, Any]) -> str:
     missing = {row["tool"]: row["why"] for row in made["rows"] if row["state"] == "not installed"}
     lines += ["", *(f"`{tool}` is not installable here: {why}." for tool, why in missing.items())] if missing else []
     return "\n".join(lines)
+
+
+def _title(made: Mapping[str, Any]) -> str:
+    seeds = ", ".join(map(str, made["seeds"]))
+    return f"{'Seeds' if len(made['seeds']) > 1 else 'Seed'} {seeds}: {made['cases']} cases, {made['date']}"
 
 
 def _cell(found: Mapping[str, Any] | None, score: Score) -> str:

@@ -23,6 +23,10 @@ FIELDS = {
 }
 
 
+LEAST_S = 6.0
+"""Least length of a held-out recording [s] (measure.py)."""
+
+
 def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[str, str]:
     """Write the cases whose files are there; names and hashes of the sealed parts. Arms that no MJCF of joints and
     columns in one order describes are left out."""
@@ -34,9 +38,10 @@ def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[s
             model = load_model(str(folder / known["sim"]), (), train[0].n)
         except (ArmlinkError, OSError):
             continue
-        if known.get("refused") or not heldout:
+        if known.get("refused") or not heldout or np.ptp(heldout[0].t) < LEAST_S:
             continue
         first, place = train[0], out / "cases" / name
+        joints = [model.mujoco_model.joint(joint).name for joint in model.joints]
         kind = (
             "torque" if first.torque is not None else "motor_torque" if first.motor_torque is not None else "positions"
         )
@@ -44,10 +49,10 @@ def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[s
         (place / "sim.xml").write_text((folder / known["sim"]).read_text(encoding="utf-8"), encoding="utf-8")
         for k, recording in enumerate(train, start=1):
             write_csv(place / f"train_{k}.csv", columns_of(recording))
-        told = {"joints": model.joints, "kind": kind, "withheld": [], "cpu_seconds": cpu_seconds}
+        told = {"joints": joints, "kind": kind, "withheld": [], "cpu_seconds": cpu_seconds}
         (place / "case.json").write_text(json.dumps(told), encoding="utf-8")
         held = {channel: np.asarray(values).tolist() for channel, values in columns_of(heldout[0]).items()}
-        label = {"case": name, "stratum": "real recordings", "joints": list(model.joints), **label_of(known, kind)}
+        label = {"case": name, "stratum": "real recordings", "joints": joints, **label_of(known, kind)}
         hashes[name] = seal(out / "sealed", name, {"label": label, "heldout": held}, key)
     return hashes
 

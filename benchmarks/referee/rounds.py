@@ -51,19 +51,31 @@ def scored(out: Path, seed: int, options: argparse.Namespace) -> Json:
         jobs = [pool.submit(score_row, row, opened[row["case"]], _sim(out, row["case"])) for row in rows]
         rows = sorted((job.result() for job in jobs), key=lambda row: (tools.index(row["tool"]), row["case"]))
     score.complete(rows)
-    made = {
+    digest = hashlib.sha256((out / "sealed" / "hashes.json").read_bytes()).hexdigest()
+    made = _result([seed], [digest], options.cpu_seconds, rows)
+    (out / "result.json").write_text(json.dumps(made, indent=1), encoding="utf-8")
+    return made
+
+
+def _result(seeds: list[int], digests: list[str], cpu_seconds: float, rows: list[Json]) -> Json:
+    return {
         "schema": "armlink.referee/1",
-        "seed": seed,
+        "seeds": seeds,
         "date": datetime.now(UTC).date().isoformat(),
-        "cases": len(opened),
-        "cpu_seconds": options.cpu_seconds,
-        "sealed": hashlib.sha256((out / "sealed" / "hashes.json").read_bytes()).hexdigest(),
+        "cases": len({row["case"] for row in rows}),
+        "cpu_seconds": cpu_seconds,
+        "sealed": digests,
         "summary": score.summary(rows),
         "no_worse": {name: score.no_worse(rows, "armlink", name, MARGIN) for name in ("residual", "rollout")},
         "rows": rows,
     }
-    (out / "result.json").write_text(json.dumps(made, indent=1), encoding="utf-8")
-    return made
+
+
+def pooled(made: list[Json]) -> Json:
+    """Several rounds as one."""
+    rows = [{**row, "case": f"{each['seeds'][0]} {row['case']}"} for each in made for row in each["rows"]]
+    seeds, digests = ([value for each in made for value in each[key]] for key in ("seeds", "sealed"))
+    return _result(seeds, digests, made[0]["cpu_seconds"], rows)
 
 
 def _drawn(options: argparse.Namespace, seed: int, out: Path, key: bytes) -> dict[str, str]:
@@ -109,7 +121,7 @@ def score_row(row: Json, opened: Json, nominal: str) -> Json:
     if row["state"] == "answered":
         answer = answer_from_json(row["answer"])
         scores = score.judge(answer, label) | {"cpu_seconds": row["cpu_seconds"]}
-        if answer.model is not None and held:
+        if answer.model is not None:
             before = errors(nominal, tuple(label["joints"]), label["kind"], held)
             try:
                 after = errors(answer.model, tuple(label["joints"]), label["kind"], held)

@@ -152,12 +152,16 @@ def test_the_table_says_who_is_better_and_what_is_not_offered():
     assert found["scores"]["first_right"]["peer"] is None
     assert score.no_worse(rows, "armlink", "residual", 0.05) == (0, 8)
     assert score.no_worse(rows, "armlink", "rollout", 0.05) == (8, 8)
-    made = {"seed": 1, "date": "2026-11-29", "cases": 8, "cpu_seconds": 60.0, "sealed": "0" * 64, "summary": found}
+    made = {"seeds": [1], "date": "2026-11-29", "cases": 8, "cpu_seconds": 60.0, "sealed": ["0" * 64], "summary": found}
     made |= {"rows": rows, "no_worse": {"residual": (0, 8)}}
     text = page.markdown([made])
     assert "| right cause first | not offered | 100 % (68 to 100; 8) |" in text
     assert "held-out residual, over the nominal model's: peer is better than armlink" in text
     assert "not offered" in page.svg(made)
+    turned = [{**each, "better": each["worse"], "worse": each["better"]} for each in found["decided"]]
+    other = {**made, "seeds": [2], "summary": {**found, "decided": turned}}
+    assert "in another: nothing." in page.markdown([made, made])
+    assert "the other way in another: residual: armlink and peer" in page.markdown([made, other])
 
 
 def test_nobody_reads_or_changes_what_is_sealed(tmp_path):
