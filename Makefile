@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: poses weigh long sound hands published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
+.PHONY: referee poses weigh long sound hands published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -37,6 +37,12 @@ format: .venv/.dev ## Put the code in shape
 
 bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
+
+referee: .venv/.dev ## One blind benchmark for every tool, an hour on two cores (ARGS="--cases 11 --seed 1 2 --only armlink nominal")
+	scripts/referee-tools
+	test -d .referee/models || $(BIN)/python -m pip install -q --no-deps --target .referee/models example-robot-data
+	PYTHONPATH=benchmarks OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 \
+	  $(BIN)/python -m referee --models .referee/models $(ARGS)
 
 long: .venv/.dev ## The tests that make test leaves out, on real SocketCAN too: more arms, cases and draws (ARGS goes to pytest)
 	scripts/run-tests --long $(ARGS)

@@ -22,7 +22,7 @@ from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import RATE, RECORDED_HZ
 from sim_gap.blind.plant import TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, recipes, servo_recipes
-from sim_gap.blind.scene import LEAST_SPEED
+from sim_gap.blind.scene import LEAST_SPEED, ServoLaw
 from sim_gap.blind.servo_plant import record_servos, simulate_servos
 
 SERVO_HZ = 50.0, 100.0
@@ -113,6 +113,21 @@ class Rig:
     def noise(self, number: int) -> np.random.Generator:
         return np.random.default_rng([*self.drawing.recipe.seed, self.drawing.attempt, number])
 
+    def totals(self) -> dict[str, list[float]]:
+        """The true values of each joint, small errors of every arm included, by effect and quantity."""
+        truth = self.truth(self.drawing.drawn)
+        state = truth.state
+        values = {
+            "friction.coulomb:torque": state.coulomb,
+            "friction.viscous:damping": state.viscous,
+            "actuator.rotor_inertia:inertia": truth.arm.armature + state.rotor_inertia,
+            "actuator.gain:gain": state.actuator_gain,
+            "torque.gain:gain": state.torque_gain,
+            "torque.offset:offset": state.torque_offset,
+            "position.offset:offset": state.position_offset,
+        }
+        return {name: each.tolist() for name, each in values.items()}
+
 
 class TorqueRig(Rig):
     """With torque sensors, under a controller with feed-forward."""
@@ -180,14 +195,24 @@ class ServoRig(Rig):
 
     def run(self, number: int, command: Array, effects: Sequence[DrawnEffect]) -> Trial:
         """The command of motion `number`, sent with each row and held until the next, under these effects."""
-        law, held = deepcopy(self.law), self.held(command)
+        held = self.held(command)
+        position = simulate_servos(self.truth(effects), held, self.true_law(effects))
+        columns = record_servos(held, position, self.hz, self.encoder_step, self.noise(2000 + number))
+        return Trial(columns, position, bool(np.abs(position - held).max() < SERVO_FOLLOWED))
+
+    def true_law(self, effects: Sequence[DrawnEffect]) -> ServoLaw:
+        law = deepcopy(self.law)
         law.stiffness *= self.small[0]
         law.damping *= self.small[1]
         for effect in effects:
             effect.law(law)
-        position = simulate_servos(self.truth(effects), held, law)
-        columns = record_servos(held, position, self.hz, self.encoder_step, self.noise(2000 + number))
-        return Trial(columns, position, bool(np.abs(position - held).max() < SERVO_FOLLOWED))
+        return law
+
+    def totals(self) -> dict[str, list[float]]:
+        """As without servos; damping is the joint's and the servo's together, since a position cannot tell them."""
+        law, values = self.true_law(self.drawing.drawn), super().totals()
+        damping = np.add(values["friction.viscous:damping"], law.damping).tolist()
+        return values | {"friction.viscous:damping": damping, "controller.stiffness:kp": law.stiffness.tolist()}
 
     def held(self, command: Array) -> Array:
         rows = round(RATE / self.hz)
@@ -243,6 +268,7 @@ def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
         recorded = {channel: values for channel, values in trial.columns.items() if channel not in rig.missing}
         write_csv(folder / f"{name}.csv", recorded)
     told = {"gap": {"with": gaps[0], "without": gaps[-1], "falls": falls}, "clear": True}
+    told["totals"] = rig.totals()
     label.write_text(json.dumps({**rig.label, **told}, indent=1), encoding="utf-8")
     return True
 

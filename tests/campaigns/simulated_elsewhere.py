@@ -161,12 +161,20 @@ def commands(arm: Arm, steps: int, random: np.random.Generator, reaching: bool) 
     return np.concatenate(parts)[:steps]
 
 
-def recorded(spec: Any, arm: Arm, random: np.random.Generator, every: int, reaching: bool, torques: bool) -> Recording:
+def recorded(
+    spec: Any,
+    arm: Arm,
+    random: np.random.Generator,
+    every: int,
+    reaching: bool,
+    torques: bool,
+    seconds: float = SECONDS,
+) -> Recording:
     """Commands held from row to row, `every` so many steps, and positions; with `torques` smooth commands, velocities
     and motors' torques."""
     model = spec.compile()
     data, n = mujoco.MjData(model), len(arm.gains)
-    given = commands(arm, round(SECONDS / STEP_S), random, reaching)
+    given = commands(arm, round(seconds / STEP_S), random, reaching)
     data.qpos[:], data.ctrl[:] = given[0], given[0]
     for i in np.flatnonzero(model.actuator_history[:, 0]).tolist():
         past = np.full((int(model.actuator_history[i, 0]), 1), given[0, i])

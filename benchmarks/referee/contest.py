@@ -1,0 +1,108 @@
+"""Runs the adapters: a process a case, in a copy of the public folder, within a limit of processor time."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+WALL_FACTOR = 20.0
+"""Wall-clock time over processor time after which a process is ended: the machine may be busy."""
+GRACE_S = 10.0
+"""Processor time beyond the limit for writing an answer [s]."""
+PROGRAM = """
+import importlib.util, json, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from referee.interface import NotOffered, load_case
+try:
+    spec = importlib.util.spec_from_file_location("adapter", sys.argv[2])
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+except ImportError as error:
+    made = {"state": "not installed", "why": str(error)}
+else:
+    try:
+        made = {"state": "answered", "answer": module.solve(load_case(Path("."))).to_json()}
+    except NotOffered as error:
+        made = {"state": "not offered", "why": str(error)}
+    except ImportError as error:
+        made = {"state": "not installed", "why": str(error)}
+    except Exception as error:
+        made = {"state": "failed", "why": f"{type(error).__name__}: {error}"[:300]}
+Path("answer.json").write_text(json.dumps(made, default=float))
+"""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """An adapter and the interpreter that runs it."""
+
+    name: str
+    adapter: Path
+    python: str
+
+
+def tools(more: list[Path], only: list[str]) -> list[Tool]:
+    """The adapters beside this file and those given. `.referee/NAME/bin/python` runs one whose tool needs other
+    versions than armlink."""
+    found = []
+    for path in [*sorted((HERE / "adapters").glob("*.py")), *more]:
+        own = HERE.parents[1] / ".referee" / path.stem / "bin" / "python"
+        found.append(Tool(path.stem, path.resolve(), str(own) if own.exists() else sys.executable))
+    return [tool for tool in found if not only or tool.name in only]
+
+
+def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
+    """State, answer and processor seconds of one tool on one case. `state` is answered, not offered, not installed,
+    failed or out of time."""
+    with tempfile.TemporaryDirectory(prefix="referee-") as scratch:
+        folder = Path(scratch) / "case"
+        shutil.copytree(public, folder)
+        command = [tool.python, "-c", PROGRAM, str(HERE.parent), str(tool.adapter)]
+        before, limit = time.monotonic(), round(cpu_seconds + GRACE_S)
+        with (folder.parent / "log").open("wb") as log:
+            process = subprocess.Popen(
+                command,
+                cwd=folder,
+                env=_environment(),
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5)),
+            )
+            used = _wait(process, WALL_FACTOR * cpu_seconds)
+        made: dict[str, Any] = {"state": "failed", "why": (folder.parent / "log").read_text(errors="replace")[-300:]}
+        if (folder / "answer.json").is_file():
+            made = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
+        elif used >= limit - 1 or time.monotonic() - before >= WALL_FACTOR * cpu_seconds:
+            made = {"state": "out of time", "why": f"more than {cpu_seconds:.0f} s"}
+        return {**made, "cpu_seconds": used}
+
+
+def _wait(process: "subprocess.Popen[bytes]", wall_seconds: float) -> float:
+    """Processor time of the process and its children [s]; it is ended after `wall_seconds`."""
+    end = time.monotonic() + wall_seconds
+    while True:
+        pid, _, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            process.returncode = 0
+            return float(usage.ru_utime + usage.ru_stime)
+        if time.monotonic() > end:
+            process.kill()
+            end = float("inf")
+        time.sleep(0.05)
+
+
+def _environment() -> dict[str, str]:
+    """One thread each, and nothing else that an adapter could learn from."""
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG", "PYTHONPATH") if name in os.environ}
+    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    return {**kept, **dict.fromkeys(threads, "1"), "PYTHONDONTWRITEBYTECODE": "1"}

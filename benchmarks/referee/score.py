@@ -1,0 +1,201 @@
+"""Scores of answers against labels, their intervals over cases, and which differences are decided. Pure functions."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from referee.interface import Answer, Cause, Parameter
+
+SURE = 0.8
+"""Confidence above which a cause is meant to be sure (interface.py)."""
+FAILED_RATIO = 1.0
+"""Of a tool that gave no model: its user is left with the nominal one."""
+LEAST_DISCORDANT = 6
+"""Least number of cases that differ: of fewer, a two-sided sign test says nothing at 5 % (2 · 0.5⁶ = 0.03)."""
+DRAWS, WILSON_Z = 2000, 1.959964
+TINY = 1e-4
+"""Relative errors and widths below this count as this."""
+TABLES = json.loads(Path(__file__).with_name("families.json").read_text(encoding="utf-8"))
+FAMILY = {effect: family for family, effects in TABLES["families"].items() for effect in effects}
+Json = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Score:
+    key: str
+    title: str
+    share: bool
+    """A share of cases, the larger the better; otherwise a geometric mean, the smaller the better, unless turned."""
+    less_is_better: bool
+
+
+SCORES = (
+    Score("first_right", "right cause first", True, False),
+    Score("read_right", "right cause first, as read from the parameters", True, False),
+    Score("false_sure", "a false cause when sure", True, True),
+    Score("abstains", "abstains where nothing can be named", True, False),
+    Score("error", "error of a parameter, over its true change", False, True),
+    Score("coverage", "95 % intervals that hold", True, False),
+    Score("width", "width of an interval, over the true change", False, True),
+    Score("residual", "held-out residual, over the nominal model's", False, True),
+    Score("rollout", "roll-out in MuJoCo, over the nominal model's", False, True),
+    Score("cpu_seconds", "seconds of a core", False, True),
+)
+
+
+def target(name: str, vocabulary: str) -> str:
+    """`effect:quantity` of a tool's word; words that no table has are their own."""
+    return str(TABLES["vocabularies"].get(vocabulary, {}).get(name, name))
+
+
+def family(name: str, vocabulary: str) -> str:
+    effect = target(name, vocabulary).partition(":")[0]
+    return str(FAMILY.get(effect, effect))
+
+
+def judge(answer: Answer, label: Json) -> dict[str, float | None]:
+    """The scores of an answer that follow from the label; None where the tool or the case does not have one."""
+    words, withheld = answer.vocabulary, set(label["withheld"])
+    true = {FAMILY[e["effect"]] for e in label["effects"] if e["effect"] not in withheld}
+    implied = {FAMILY[name] for e in label["effects"] for name in e["implied"] if name in FAMILY}
+    alike = {FAMILY[name] for e in label["effects"] if e["undecided"] for name in e["confused_with"] if name in FAMILY}
+    right, fine = true | alike, true | alike | implied | {FAMILY[name] for name in label["nearest"]}
+    nameable, whole = bool(true), not withheld and not label["outside"]
+    scores: dict[str, float | None] = dict.fromkeys(each.key for each in SCORES)
+    if answer.causes is not None:
+        false = any(c.confidence > SURE and family(c.name, words) not in fine for c in answer.causes)
+        scores["false_sure"] = float(false)
+        if nameable:
+            scores["first_right"] = float(_first(answer.causes, words, right, implied) in right)
+        elif not label.get("real"):
+            scores["abstains"] = float(not false)
+    if answer.parameters is not None and whole:
+        scores |= _parameter_scores(answer.parameters, words, label["truth"])
+        stated = [p for p in answer.parameters if p.low is not None and p.high is not None and p.nominal is not None]
+        if nameable and stated:
+            scores["read_right"] = float(family(max(stated, key=_deviations).name, words) in right)
+    return scores
+
+
+def _first(causes: Sequence[Cause], words: str, right: set[str], implied: set[str]) -> str:
+    """Family of the first cause; those that a true effect brings with it are skipped."""
+    named = [family(cause.name, words) for cause in causes]
+    return next((each for each in named if each in right or each not in implied), "")
+
+
+def _deviations(p: Parameter) -> float:
+    """Distance from the nominal value, in half widths of the interval."""
+    low, high, nominal = (p.value if x is None else x for x in (p.low, p.high, p.nominal))
+    return abs(p.value - nominal) / max(0.5 * (high - low), 1e-12)
+
+
+def _parameter_scores(parameters: Sequence[Parameter], words: str, truth: Iterable[Json]) -> dict[str, float | None]:
+    known = {(f"{row['effect']}:{row['quantity']}", row["joint"]): row for row in truth}
+    errors, widths, inside = [], [], []
+    for p in parameters:
+        row = known.get((target(p.name, words), p.joint))
+        if row is None:
+            continue
+        change = abs(row["value"] - row["nominal"])
+        if row["drawn"] and change > 0.0:
+            errors.append(math.log(max(abs(p.value - row["value"]) / change, TINY)))
+        if p.low is not None and p.high is not None:
+            inside.append(p.low <= row["value"] <= p.high)
+            if row["drawn"] and change > 0.0:
+                widths.append(math.log(max((p.high - p.low) / change, TINY)))
+    return {
+        "error": math.exp(np.mean(errors)) if errors else None,
+        "width": math.exp(np.mean(widths)) if widths else None,
+        "coverage": float(np.mean(inside)) if inside else None,
+    }
+
+
+def complete(rows: Sequence[dict[str, Any]]) -> None:
+    """Count a tool that failed as one that named nothing and left the nominal model, in the scores that it offers for
+    other cases of that kind."""
+    for row in rows:
+        if row["state"] in ("failed", "out of time"):
+            same = [r for r in rows if r["tool"] == row["tool"] and r["state"] == "answered"]
+            offered = {key for r in same for key, value in r["scores"].items() if value is not None}
+            empty = {"first_right": 0.0, "read_right": 0.0, "false_sure": 0.0, "abstains": 1.0}
+            empty |= {"residual": FAILED_RATIO, "rollout": FAILED_RATIO}
+            for key, value in empty.items():
+                applies = row["nameable"] if key.endswith("right") else not row["nameable"] or key != "abstains"
+                if key in offered and applies:
+                    row["scores"][key] = value
+
+
+def summary(rows: Sequence[dict[str, Any]], seed: int = 0) -> dict[str, Any]:
+    """Every score of every tool with its interval, and the pairs of tools of which a score decides."""
+    tools = list(dict.fromkeys(row["tool"] for row in rows))
+    table: dict[str, dict[str, Any]] = {}
+    decided: list[dict[str, Any]] = []
+    for score in SCORES:
+        values = {tool: _by_case(rows, tool, score.key) for tool in tools}
+        table[score.key] = {
+            tool: estimate([*cases.values()], score, seed) if cases else None for tool, cases in values.items()
+        }
+        for better, worse in permutations(tools, 2):
+            common = values[better].keys() & values[worse].keys()
+            pairs = [(values[better][case], values[worse][case]) for case in sorted(common)]
+            if is_decided(pairs, score, seed):
+                decided.append({"score": score.key, "better": better, "worse": worse, "cases": len(pairs)})
+    return {"tools": tools, "scores": table, "decided": decided}
+
+
+def _by_case(rows: Sequence[dict[str, Any]], tool: str, key: str) -> dict[str, float]:
+    return {r["case"]: r["scores"][key] for r in rows if r["tool"] == tool and r["scores"].get(key) is not None}
+
+
+def estimate(values: Sequence[float], score: Score, seed: int = 0) -> dict[str, float]:
+    """Mean share or geometric mean over cases, with its 95 % interval: Wilson's of yes or no, else the bootstrap's."""
+    if score.share and set(values) <= {0.0, 1.0}:
+        low, high = wilson(sum(values), len(values))
+        return {"value": float(np.mean(values)), "low": low, "high": high, "cases": len(values)}
+    x = np.asarray(values, float) if score.share else np.log(np.maximum(values, TINY))
+    draws = _resampled(x, seed)
+    back = (lambda y: float(y)) if score.share else (lambda y: math.exp(y))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return {"value": back(x.mean()), "low": back(low), "high": back(high), "cases": len(values)}
+
+
+def wilson(count: float, total: int) -> tuple[float, float]:
+    """95 % interval of a share."""
+    share, z2 = count / total, WILSON_Z**2
+    middle = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = WILSON_Z / (1 + z2 / total) * math.sqrt(share * (1 - share) / total + z2 / (4 * total**2))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def is_decided(pairs: Sequence[tuple[float, float]], score: Score, seed: int = 0) -> bool:
+    """Whether the first of each pair is better: the 95 % interval of the mean difference over cases excludes zero, and
+    enough cases differ."""
+    both = np.reshape(np.asarray(pairs, float), (-1, 2))
+    if not score.share:
+        both = np.log(np.maximum(both, TINY))
+    better = (both[:, 1] - both[:, 0]) if score.less_is_better else (both[:, 0] - both[:, 1])
+    if np.count_nonzero(better) < LEAST_DISCORDANT:
+        return False
+    return bool(np.quantile(_resampled(better, seed), 0.025) > 0.0)
+
+
+def _resampled(x: Any, seed: int) -> Any:
+    """Bootstrap means."""
+    return np.random.default_rng(seed).choice(x, (DRAWS, len(x))).mean(1)
+
+
+def no_worse(rows: Sequence[dict[str, Any]], tool: str, key: str, margin: float) -> tuple[int, int]:
+    """In how many cases a tool is at most `margin` above the best other one in a score of which less is better, and in
+    how many it could be compared."""
+    cases = _by_case(rows, tool, key)
+    others = [_by_case(rows, other, key) for other in {row["tool"] for row in rows} - {tool}]
+    best = {
+        case: min(each[case] for each in others if case in each) for case in cases if any(case in o for o in others)
+    }
+    return sum(cases[case] <= (1.0 + margin) * value for case, value in best.items()), len(best)
