@@ -93,6 +93,8 @@ SMALLEST_TORQUE = 1e-9
 """Standard deviation from which a reading changes [N·m]."""
 ERROR_LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
 """Least and largest such error of a sound arm, as a share: a torque below a third of the model's is in another unit."""
+IDLE_COST = 4.0 * PRICE
+"""Negative log likelihood of a motor that is idle, or of a dead sensor: the price of an effect that few arms have."""
 RANGE_COST = 5.0 * PRICE
 """Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
 JOINT_EFFECTS, FRICTION_EFFECTS = 6, 3
@@ -164,7 +166,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     turn[..., JOINT_EFFECTS, 0] = _model_size(model)
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
     without[..., 0, :], without[..., :, 0] = 0.0, 0.0
-    other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + PRICE
+    other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
     whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
     return np.asarray(whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))
@@ -237,7 +239,7 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     if idle.any():
         free = np.full_like(spread[:, 1:], -np.inf), np.full_like(spread[:, 1:], np.inf)
         none = np.zeros((0, *left.shape)), np.zeros(0), np.zeros((2, 0))
-        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + PRICE / FOLDS
+        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + IDLE_COST / FOLDS
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))
