@@ -13,14 +13,12 @@ import numpy as np
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms, fold_sums
 from sim_gap.checks.joint_range import beyond_range
-from sim_gap.model.rigid_body import INERTIAL, RigidArm
+from sim_gap.model.rigid_body import CREEP, INERTIAL, RigidArm
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import FOLDS
 
 ROWS = 1500
 """Rows that are looked at."""
-TURNING = 0.02
-"""Speed from which friction has its full sign [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +43,12 @@ class ChannelMotion:
     @property
     def direction(self) -> Array:
         """Sign of the velocity, rounded off around zero (K, n)."""
-        return np.clip(self.v / TURNING, -1.0, 1.0)
+        return np.clip(self.v / CREEP, -1.0, 1.0)
 
     @property
     def telling(self) -> Mask:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
-        return np.asarray(((np.abs(self.v) > TURNING) | (self.channel == "tau")) & np.isfinite(self.reading))
+        return np.asarray(((np.abs(self.v) > CREEP) | (self.channel == "tau")) & np.isfinite(self.reading))
 
     def rows(self, rows: slice) -> "ChannelMotion":
         q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
@@ -114,7 +112,7 @@ def measurements(motion: ChannelMotion) -> Array:
 def _measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
     """The same of motions with as many rows: q, v (…, K, n), size (…, n); (…, n)."""
     stroke = 2.0 * q.std(-2)
-    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > TURNING, axis=-2) > SMALLEST_MOVING_SHARE)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=-2) > SMALLEST_MOVING_SHARE)
     strokes = np.where(moving, 1.0 / np.maximum(stroke, SMALLEST_STROKE), 0.0)
     squares = ((v * strokes[..., None, :]) ** 2).sum(-1) / np.maximum(moving.sum(-1), 1)[..., None]
     count = np.minimum(MEASUREMENTS_PER_STROKE * np.sqrt(squares).mean(-1) * duration, MOST_MEASUREMENTS)
@@ -127,7 +125,7 @@ def _own_columns(
     """Columns of the P own effects of each joint (…, n, P, K), friction and rotor at the end, which are not negative,
     and their standard deviations (…, n, P), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
     size = _model_size(model)
-    turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / TURNING, -1.0, 1.0)
+    turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / CREEP, -1.0, 1.0)
     turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
     own = [model / size[..., None, :], np.ones_like(q), turned, direction, v, a]
     columns = np.moveaxis(np.stack(own, axis=-3), -1, -3)
