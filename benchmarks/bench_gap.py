@@ -17,7 +17,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model, read_spec
 from sim_gap.residuals.layout import layout_of
-from sim_gap.residuals.location import by_joint
+from sim_gap.residuals.location import by_joint, row_rms
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 
@@ -97,7 +97,8 @@ def heldout_error(fitted: Wrong) -> float:
     spec = read_spec(Path(ARM))
     _put(spec, fitted)
     signals = prepare(recordings()[1], load_model(spec.compile()).arm)
-    return float(by_joint(ResidualSet((signals,), layout_of([signals]))).mean())
+    data = ResidualSet((signals,), layout_of([signals]))
+    return float(by_joint(data, row_rms(data)).mean())
 
 
 @cache

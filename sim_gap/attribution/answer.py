@@ -15,7 +15,7 @@ from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps
-from sim_gap.residuals.location import Location, by_joint, combine_by_joint, locate
+from sim_gap.residuals.location import Location, by_joint, locate, row_rms
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate
 
@@ -48,17 +48,20 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
-    before, after, margin = by_joint(judge), by_joint(judge, left), combine_by_joint(judge, judge.margin)
+    hints = [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]
+    shown = hints if result == "unexplained" else found
+    levels = row_rms(judge), row_rms(judge, left), judge.margin, judge.floor
+    before, after, margin, floor = (by_joint(judge, each) for each in levels)
     return Diagnosis(
         verdict=result,
         names=made.model.arm.names,
         where=(*locate(judge), *aside),
         left_out=share_left_out(judge),
-        causes=tuple(_hints(found) if result == "unexplained" else found),
+        causes=tuple(shown),
         minor=tuple(minor),
-        noise_floor=combine_by_joint(judge, judge.floor),
-        train_before=by_joint(fit),
-        train_after=by_joint(fit, left_fit),
+        noise_floor=floor,
+        train_before=by_joint(fit, row_rms(fit)),
+        train_after=by_joint(fit, row_rms(fit, left_fit)),
         heldout_before=before,
         heldout_after=after,
         unexplained=share_left(judge, left),
@@ -107,8 +110,3 @@ def _rolled(made: Internals, found: list[Cause], laws: Sequence[ResidualLaw]) ->
         made.nominal,
         as_effects(laws, made.model.arm.names),
     )
-
-
-def _hints(found: list[Cause]) -> list[Cause]:
-    """The causes with their confidence capped, for a gap that remains unexplained."""
-    return [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]

@@ -11,6 +11,7 @@ from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
+from sim_gap.search.model_selection import AGAIN
 from sim_gap.search.term import Term
 
 
@@ -72,15 +73,13 @@ def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> Residual
             alone = ResidualSet((tried[0],), heldout.layout)
             own, _ = _own(estimate, estimate.on(alone), body, 0)
             turned = replace(tried[0], mount=_turn(s, estimate.of(body), own))
-            best = turned if _left(estimate, replace(alone, signals=(turned,))) < min(left) - CLEARLY else best
+            best = turned if _left(estimate, replace(alone, signals=(turned,))) < min(left) - AGAIN else best
         out.append(best)
     return ResidualSet(tuple(out), heldout.layout)
 
 
 TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
-CLEARLY = 0.5
-"""Fall of Σ ½ log(R² + floor²) over the rows from which it does."""
 ALIKE = 0.5
 """Largest difference of two bodies' mass and moment, as a share of the larger, for one to be the other, turned."""
 OF_A_BODY, NEAR = 0.1, 2.0

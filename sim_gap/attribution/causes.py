@@ -36,10 +36,6 @@ class CauseStep:
         return float(np.max(self.before - self.after))
 
 
-FLOOR_KNOWN = 1.05
-"""A remaining residual counts as more than noise from this multiple of the noise floor, which is known no better."""
-
-
 class _Scorer:
     def __init__(self, estimate: EffectEstimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
@@ -59,7 +55,7 @@ class _Scorer:
         raw = np.maximum(self.squares([]), final)
         r = int(np.argmax(np.where(self.counts, np.sqrt(without) - np.sqrt(final), -np.inf)))
         floor = np.array([data.floor[row] for row in rows])
-        above = np.maximum(final - (FLOOR_KNOWN * floor) ** 2, 0.0)
+        above = np.maximum(final - floor**2, 0.0)
         gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
         elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
         excess = float(np.sqrt(final[r])) / data.relevance_floor[rows[r]]
@@ -135,9 +131,6 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
 MINOR = 0.6
 """Share of the smallest relevant gap of the rows in which it shows by which a cause must lower some joint's RMS not to
 be minor."""
-WITHIN_NM = 0.08
-"""Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
-could explain them."""
 
 
 def relevant_terms(
@@ -155,8 +148,7 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
-    least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
+    least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, heldout.relevant_nm)
     others = [term for term in estimate.terms if term not in step.terms]
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
     falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)

@@ -18,7 +18,6 @@ from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
 from sim_gap.attribution.bodies import (
-    CLEARLY,
     body_of,
     groups_of,
     mounts,
@@ -47,7 +46,7 @@ from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, 
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.model_selection import ROUNDS, select_model
+from sim_gap.search.model_selection import AGAIN, ROUNDS, select_model
 from sim_gap.search.term_equations import TermChoice
 
 OWN_HELDOUT = 0.3
@@ -174,7 +173,7 @@ def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, Eff
             break
         turned = tuple(replace(s, mount=angle) for s, angle in zip(signals, angles, strict=True))
         again = select_model(ColumnStore(ResidualSet(turned, fit.layout)), library)
-        if again.score > search.score - CLEARLY * search.equations.measurements:
+        if again.score > search.score - AGAIN * search.equations.measurements:
             break
         search, estimate = again, EffectEstimate(again.equations.store, again.current)
     return search, estimate

@@ -9,13 +9,11 @@ from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.rivals import AS_GOOD
-from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.registry import LAWS
 from sim_gap.residuals.channel_quality import Stuck
-from sim_gap.residuals.disregarded_rows import AROUND_S
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.location import Location, locate
-from sim_gap.residuals.preprocess import ABSENT
+from sim_gap.residuals.location import Location, locate, row_rms
+from sim_gap.residuals.preprocess import ABSENT, TRIM_S
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import NOMINAL, EffectEstimate
 from sim_gap.search.term import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
@@ -92,7 +90,7 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     lines = (
         f"{s.label}: at {one.start:.1f} s, and at no other time, several joints differ suddenly from the "
         f"fit, {s.arm.names[one.joint]} by {one.torque:.2g} N·m: something touched the arm, or torques were "
-        f"misread; {one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
+        f"misread; {one.end - one.start + 2.0 * TRIM_S:.1f} s are left out"
         for data in sets
         for s in data.signals
         for one in s.disturbances

@@ -13,7 +13,8 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs, Verdict
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet, root_mean_square
+from sim_gap.residuals.location import row_rms
+from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet
 
 WEIGHTS = {"constant": -3.37, "evidence": 0.42, "left": -0.87, "elsewhere": -2.9, "outside": 1.3}
 """Weights of the constant and of each feature."""
@@ -52,12 +53,6 @@ def features(signs: Signs) -> dict[str, float]:
 
 NEAR, ROW_LEFT = 2.0, 0.15
 """Most that may remain of a row: this many times its margin, or this share of its RMS."""
-
-
-def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
-    """RMS of each row with valid samples [N·m]; of `left` if given, else of the raw residual."""
-    values = data.values if left is None else left
-    return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
 
 
 def is_within(data: ResidualSet) -> bool:

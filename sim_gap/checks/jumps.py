@@ -10,7 +10,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.sampling import fill
-from sim_gap.checks.sound_arm import TURNING
+from sim_gap.model.rigid_body import CREEP
 
 JUMP, TIMES = 0.05, 8.0
 """Step from row to row from which a position jumps [rad], and its speed over what is usual at the joint."""
@@ -81,7 +81,7 @@ def _jumps(t: Array, q: Array) -> Array:
     steps = np.diff(medfilt(np.interp(t, t[there], q[there]), 3))
     time = np.maximum(np.diff(t), float(np.median(np.diff(t))))
     speed = np.abs(steps) / time
-    moving = speed[speed > TURNING]
+    moving = speed[speed > CREEP]
     usual = float(np.quantile(speed, USUAL))
     if moving.size >= FEW_MOVING:
         usual = max(usual, float(np.quantile(moving, MOVING)))

@@ -13,14 +13,12 @@ import numpy as np
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms, fold_sums
 from sim_gap.checks.joint_range import beyond_range
-from sim_gap.model.rigid_body import INERTIAL, RigidArm
+from sim_gap.model.rigid_body import CREEP, INERTIAL, RigidArm
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import FOLDS
 
 ROWS = 1500
 """Rows that are looked at."""
-TURNING = 0.02
-"""Speed from which friction has its full sign [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +43,12 @@ class ChannelMotion:
     @property
     def direction(self) -> Array:
         """Sign of the velocity, rounded off around zero (K, n)."""
-        return np.clip(self.v / TURNING, -1.0, 1.0)
+        return np.clip(self.v / CREEP, -1.0, 1.0)
 
     @property
     def telling(self) -> Mask:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
-        return np.asarray(((np.abs(self.v) > TURNING) | (self.channel == "tau")) & np.isfinite(self.reading))
+        return np.asarray(((np.abs(self.v) > CREEP) | (self.channel == "tau")) & np.isfinite(self.reading))
 
     def rows(self, rows: slice) -> "ChannelMotion":
         q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
@@ -93,6 +91,8 @@ SMALLEST_TORQUE = 1e-9
 """Standard deviation from which a reading changes [N·m]."""
 ERROR_LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
 """Least and largest such error of a sound arm, as a share: a torque below a third of the model's is in another unit."""
+IDLE_COST = 4.0 * PRICE
+"""Negative log likelihood of a motor that is idle, or of a dead sensor: the price of an effect that few arms have."""
 RANGE_COST = 5.0 * PRICE
 """Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
 JOINT_EFFECTS, FRICTION_EFFECTS = 6, 3
@@ -112,7 +112,7 @@ def measurements(motion: ChannelMotion) -> Array:
 def _measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
     """The same of motions with as many rows: q, v (…, K, n), size (…, n); (…, n)."""
     stroke = 2.0 * q.std(-2)
-    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > TURNING, axis=-2) > SMALLEST_MOVING_SHARE)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=-2) > SMALLEST_MOVING_SHARE)
     strokes = np.where(moving, 1.0 / np.maximum(stroke, SMALLEST_STROKE), 0.0)
     squares = ((v * strokes[..., None, :]) ** 2).sum(-1) / np.maximum(moving.sum(-1), 1)[..., None]
     count = np.minimum(MEASUREMENTS_PER_STROKE * np.sqrt(squares).mean(-1) * duration, MOST_MEASUREMENTS)
@@ -125,7 +125,7 @@ def _own_columns(
     """Columns of the P own effects of each joint (…, n, P, K), friction and rotor at the end, which are not negative,
     and their standard deviations (…, n, P), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
     size = _model_size(model)
-    turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / TURNING, -1.0, 1.0)
+    turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / CREEP, -1.0, 1.0)
     turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
     own = [model / size[..., None, :], np.ones_like(q), turned, direction, v, a]
     columns = np.moveaxis(np.stack(own, axis=-3), -1, -3)
@@ -164,7 +164,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     turn[..., JOINT_EFFECTS, 0] = _model_size(model)
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
     without[..., 0, :], without[..., :, 0] = 0.0, 0.0
-    other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + PRICE
+    other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
     whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
     return np.asarray(whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))
@@ -237,7 +237,7 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     if idle.any():
         free = np.full_like(spread[:, 1:], -np.inf), np.full_like(spread[:, 1:], np.inf)
         none = np.zeros((0, *left.shape)), np.zeros(0), np.zeros((2, 0))
-        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + PRICE / FOLDS
+        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + IDLE_COST / FOLDS
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))

@@ -17,7 +17,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_quality import Disturbance, spectrum
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
-from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, PreparedSignals
+from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, TRIM_S, PreparedSignals
 from sim_gap.residuals.residual_set import FEWEST, MOVING_SHARE, ResidualSet, root_mean_square
 
 LOWEST_PEAK_HZ = 1.5 * BAND_HZ
@@ -58,8 +58,6 @@ JOINTS, SHARE = 3, 0.5
 """Least number of joints that are far off at once, and least share of those that are judged then."""
 AT_ONCE_S = 0.12
 """Time within which joints are far off at once [s]."""
-AROUND_S = 0.2
-"""Time before and after that is left out, too: the length of the comparison's low pass [s]."""
 LONGEST_S = 0.6
 """Longest disturbance, without the time around it [s]: what lasts is a property of the arm, or a body it took up."""
 RARE = 0.02
@@ -100,7 +98,7 @@ def calm_weight(time: Array, found: tuple[Disturbance, ...]) -> Array:
     """1 away from disturbances, 0 in them and around, (K,)."""
     out = np.ones(len(time))
     for one in found:
-        out[(time >= one.start - AROUND_S) & (time <= one.end + AROUND_S)] = 0.0
+        out[(time >= one.start - TRIM_S) & (time <= one.end + TRIM_S)] = 0.0
     return out
 
 

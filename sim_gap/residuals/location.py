@@ -82,20 +82,16 @@ def _regime(residual: Array, features: dict[str, Array]) -> tuple[str, float]:
     return (best, shares[best]) if shares[best] >= CLEAR else ("other", 1.0 - shares[best])
 
 
-def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
-    """RMS per joint [N·m]: root of the sum of mean squares over its channels, (n,); of `left` if given."""
+def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
+    """RMS of each row with valid samples [N·m]; of `left` if given, else of the raw residual."""
     values = data.values if left is None else left
-    squares = np.zeros(data.layout.n)
-    for channel, joint in data.rows:
-        if (valid := data.valid[channel, joint]).any():
-            squares[joint] += np.mean(values[channel, joint][valid] ** 2)
-    return np.asarray(np.sqrt(squares))
+    return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
 
 
-def combine_by_joint(data: ResidualSet, levels: dict[Row, float]) -> Array:
-    """A level per row (noise floor, margin), combined per joint as in `by_joint`, (n,)."""
+def by_joint(data: ResidualSet, levels: dict[Row, float]) -> Array:
+    """Levels of the rows (RMS, noise floor, margin) per joint: root of the sum of squares over its channels, (n,)."""
     squares = np.zeros(data.layout.n)
-    for channel, joint in data.rows:
-        if data.valid[channel, joint].any():
-            squares[joint] += levels[channel, joint] ** 2
+    for row in data.rows:
+        if data.valid[row].any():
+            squares[row[1]] += levels[row] ** 2
     return np.asarray(np.sqrt(squares))

@@ -27,6 +27,12 @@ SYSTEMATIC = 0.3
 length."""
 
 
+def _sandwich(inverse: Array, scores: Array) -> Array:
+    """Covariance of parameters (P, P) from the inverse of their normal equations and the scores of clusters (C, P)."""
+    clusters = max(len(scores), 2)
+    return np.asarray(inverse @ (scores.T @ scores) @ inverse * clusters / (clusters - 1))
+
+
 @dataclass(frozen=True)
 class Value:
     value: float
@@ -96,7 +102,8 @@ class EffectEstimate:
     def covariance(self) -> Array:
         """Covariance of coefficients and fitted shapes, (P + S, P + S): a sandwich estimate over blocks of time, plus
         systematic errors: SYSTEMATIC times each row's residual along the column itself, undetected errors of the links'
-        mass moments, and the effect's standard deviation over sound arms."""
+        mass moments, and the effect's standard deviation over sound arms; wider by what changes from recording to
+        recording."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:
@@ -106,15 +113,34 @@ class EffectEstimate:
         bread[own, own] += self.linear.prior
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
-        blocks = max(len(scores), 2)
         systematic = SYSTEMATIC**2 * float(self.linear.counts.sum()) / max(len(self._jacobian), 1) * inverse
-        statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
         background = np.zeros(size)
         for term in self.terms:
             usual = term.form.plausibility
             std = self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
             background[self.equations.at[term]] = std
-        return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
+        whole = _sandwich(inverse, scores) + systematic + self._undetected(inverse) + np.diag(background**2)
+        wider = self._widening(whole, inverse, scores)
+        return np.asarray(whole * wider * wider[:, None])
+
+    def _widening(self, whole: Array, inverse: Array, scores: Array) -> Array:
+        """Factor on the standard deviations of a covariance for what changes from recording to recording, (P + S,).
+
+        A sandwich over whole recordings has that, one over blocks of time not. What it has more is a variance with as
+        many degrees of freedom as there are recordings less one; the sum has those of Satterthwaite (Biometrics
+        Bulletin 2, 1946), and Student's factor for them is in this one.
+        """
+        data = self.store.data
+        lasts = np.cumsum(data.lengths) - 1
+        count = len(lasts)
+        if count < 2:
+            return np.ones(len(whole))
+        of_recordings = np.add.reduceat(scores, [0, *(data.blocks[lasts[:-1]] + 1).tolist()], axis=0)
+        own = np.maximum(np.diag(whole), 1e-300)
+        both = (np.diag(_sandwich(inverse, each)) for each in (of_recordings, scores))
+        excess = np.maximum(np.subtract(*both), 0.0)
+        freedom = (own + excess) ** 2 / (own**2 / self._freedom + excess**2 / (count - 1))
+        return np.asarray(np.sqrt(1.0 + excess / own) * stdtrit(freedom, 0.975) / self._quantile)
 
     def _undetected(self, inverse: Array) -> Array:
         """Contribution to the covariance of undetected errors z of the links' mass moments, (P + S, P + S).

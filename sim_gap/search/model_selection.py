@@ -30,10 +30,6 @@ def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     return [*rest, bodies[0]] if several and bodies else []
 
 
-OFF = 0.05
-"""A torque constant is off from this share on."""
-
-
 def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is chosen.
 
@@ -48,12 +44,6 @@ def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     return [*drives, *(term for term in choice.current if term.effect not in links)]
 
 
-def most_are_off(choice: TermChoice) -> bool:
-    """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
-    off = [abs(float(c[0])) > OFF for term, c in choice.values().items() if term.effect == CONSTANT]
-    return 2 * sum(off) > choice.equations.layout.n
-
-
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered, chosen = first_search(store, library)
@@ -65,7 +55,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
     if start := every_constant(choice, offered):
         again = search_again(store, start, offered, frozenset({CONSTANT}))
         together = PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)  # of one effect that few arms have
-        choice = again if again.score + together < choice.score and most_are_off(again) else choice
+        choice = again if again.score + together < choice.score else choice
     for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
     return choice

@@ -48,6 +48,36 @@ def test_coverage(trials, monkeypatch):
     assert np.median(widths) < 0.3
 
 
+RECORDINGS = 4
+
+
+@pytest.mark.parametrize("trials", [FEW, pytest.param(TRIALS, marks=pytest.mark.long)])
+def test_intervals_cover_what_changes_from_recording_to_recording(trials: int) -> None:
+    """Friction of 0.8 N·m that varies by a quarter from day to day: many readings of one day do not average that."""
+    held = []
+    for trial in range(trials):
+        low, high = friction_of_days(0.8 + 0.2 * np.random.default_rng(trial).normal(size=RECORDINGS), trial)
+        held.append(low <= 0.8 <= high)
+    assert np.mean(held) >= 0.88
+
+
+def test_intervals_are_no_wider_where_nothing_changes() -> None:
+    widths = [np.ptp(friction_of_days(np.full(count, 0.8), 0)) for count in (1, RECORDINGS)]
+    assert widths[1] < 1.01 * widths[0]
+
+
+def friction_of_days(friction: np.ndarray, seed: int) -> tuple[float, float]:
+    """Interval of joint 2's friction from one recording for each of these [N·m]."""
+    nominal, signals = load_model(model()), []
+    for number, own in enumerate(friction):
+        moved = record(model(), Wrong(coulomb=np.array([0.0, own, 0.0])), 100 * seed + number, seconds=12.0, rate=30.0)
+        signals.append(prepare(moved, nominal.arm, number=number + 1))
+    term = Term("friction.coulomb", 1)
+    estimate = EffectEstimate(ColumnStore(ResidualSet(tuple(signals), layout_of(signals))), [term])
+    (value,) = estimate.parameters(term).values()
+    return value.low, value.high
+
+
 @pytest.mark.parametrize("trials", [3, pytest.param(10, marks=pytest.mark.long)])
 def test_an_arm_that_is_a_little_wrong_everywhere_is_allowed_for(trials):
     """Mass moments 1 % off, a few hundredths of friction and offset per joint: the effect's own size is covered."""
