@@ -7,12 +7,13 @@ from itertools import combinations, product
 import numpy as np
 
 from calib.fit.calibration import VERY_STRONG_EVIDENCE
-from calib.observer.config import LONGEST_WINDOW, ObserverConfig
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
 from calib.observer.evidence import DRIFT, ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
+from gcomp.estimate.posterior import linear_posterior
 from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_stiffness
 from gcomp.identify.readings import StaticReadings
 
@@ -205,6 +206,14 @@ class CauseTest:
         values[at] = fit.values[: len(at)]
         covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
         return values, covariance
+
+    def sensor(self, joint: int) -> tuple[Array, Array]:
+        """Change of a joint's gain and offset (2,), drawn towards nothing where rows tell little; its covariance."""
+        columns = self.found.columns[self.found.index("drift", joint)]
+        fit = linear_posterior(
+            columns, self.found.residual, np.zeros(2), np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
+        )
+        return fit.x, fit.covariance
 
     def noticed(self, cause: str, joint: int) -> float:
         """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""

@@ -164,7 +164,7 @@ def _joints_alike(test: CauseTest, joint: int) -> int:
 
 @dataclass(frozen=True)
 class Event:
-    """One event. `kind`: alarm, outliers, verdict, proposal or undecided."""
+    """One event. `kind`: alarm, verdict, proposal or undecided."""
 
     t: float
     kind: str

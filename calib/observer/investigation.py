@@ -12,9 +12,13 @@ from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing
+from calib.observer.discrepancy import PLACE_SIZE
 from calib.observer.evidence import Verdict
 from calib.observer.saved_values import read_rows, save_rows
-from calib.observer.tracking import PLACE_ROWS, PLACE_SIZE, Tracking
+from calib.observer.tracking import Tracking
+
+PLACE_ROWS = 3
+"""Rows of one place that a window takes: another one there adds no information about the rest of the joint range."""
 
 
 class Investigation:
@@ -129,18 +133,23 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
     if not tracking.belief.learnt:
         if len(window) < config.window:
             return
-        tracking.adapt(window[: -len(window) // 4])  # a change in the newest rows is not discrepancy
-    verdict = tracking.cause_test(window).verdict()
+        tracking.belief.adapt(
+            window[: -len(window) // 4], tracking.sigma
+        )  # a change in the newest rows is not discrepancy
+    test = tracking.cause_test(window)
+    verdict = test.verdict()
     if verdict.cause == "unknown":
         state.doubtful += 1
         # longer than a change takes to fill the window; an alarm would be open if it were a contact
         patience = DOUBTED if tracking.belief.is_first else LONGEST_WINDOW // AUDIT_ROWS + 1
         if state.doubtful >= patience:
-            tracking.adapt(window)
-            verdict = tracking.cause_test(window).verdict()
+            tracking.belief.adapt(window, tracking.sigma)
+            test = tracking.cause_test(window)
+            verdict = test.verdict()
     state.doubtful = state.doubtful if verdict.cause == "unknown" else 0
     if verdict.cause == "none":
-        tracking.learn(state.settled(tracking.belief.is_first))
+        tracking.follow(test)
+        tracking.belief.learn(state.settled(tracking.belief.is_first), tracking.sigma)
         return
     del state.window[:-LONGEST_WINDOW]
     state.learned = min(state.learned, len(state.window))
