@@ -159,7 +159,9 @@ class MotorBelief:
         self.mean = np.zeros(self._at["rho"].stop)
         std = np.zeros_like(self.mean)
         self.mean[self._at["gain"]] = 1.0
-        std[self._at["gain"]], std[self._at["offset"]], zero = _sensors(calibration, rated, doubt)
+        scale = np.abs(calibration.values("gain", 1.0))
+        std[self._at["gain"]] = calibration.std("gain", doubt.gain) / scale
+        std[self._at["offset"]] = calibration.std("offset", doubt.offset_share * rated) / scale
         for family in ("coulomb", "load", "viscous", "asymmetry"):
             self.mean[self._at[family]], std[self._at[family]] = np.array([getattr(each, family) for each in motors]).T
         warming = np.array([each.gain_per_kelvin or (0.0, 0.0) for each in motors])
@@ -167,7 +169,8 @@ class MotorBelief:
         self.reference_temperature = np.array(
             [np.nan if each.temperature is None else each.temperature for each in motors]
         )
-        std[self._at["zero"]] = np.append(np.hypot(zero[:-1], ZERO_STD), LAST_ZERO)
+        zero = calibration.std("position_offset", 0.0)[:-1]
+        std[self._at["zero"]] = np.append(np.hypot(zero, ZERO_STD), LAST_ZERO)
         coulomb = np.maximum(self.mean[self._at["coulomb"]], 1e-3 * rated)
         std[self._at["uneven"]] = np.repeat(doubt.uneven * coulomb, (len(std[self._at["uneven"]])) // n)
         self.mean[self._at["beta"]] = gravity.beta
@@ -255,16 +258,3 @@ def _motor(motor: MotorTorque | None) -> MotorTorque:
     """A joint without a record of friction, which did not creep, may have any."""
     nothing = (0.0, 0.0)
     return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
-
-
-def _sensors(calibration: CalibrationRecord, rated: Array, doubt: MotorDoubt) -> tuple[Array, Array, Array]:
-    """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; where one is not known, what is
-    assumed before any sweep."""
-    known = {name: float(row[at]) ** 0.5 for at, (name, row) in enumerate(
-        zip(calibration.covariance_of, calibration.covariance, strict=True))}  # fmt: skip
-    gain, offset, zero = (np.empty(len(rated)) for _ in range(3))
-    for j, joint in enumerate(calibration.joints):
-        gain[j] = known.get(f"{joint.name}.gain", doubt.gain) / abs(joint.gain or 1.0)
-        offset[j] = known.get(f"{joint.name}.offset", doubt.offset_share * rated[j]) / abs(joint.gain or 1.0)
-        zero[j] = known.get(f"{joint.name}.position_offset", 0.0)
-    return gain, offset, zero

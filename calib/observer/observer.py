@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest, DetectionLimits
+from calib.observer.cause_test import CauseTest
 from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, NOISE_SHARE, ObserverConfig
 from calib.observer.decision import Agreeing, DriftFinding, Event, decide, verdict_evidence, windows_agree
 from calib.observer.discrepancy import DiscrepancyLevel
-from calib.observer.evidence import Verdict
+from calib.observer.evidence import DetectionLimits, Verdict
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed, may_adapt
+from calib.observer.investigation import Investigation
 from calib.observer.moving_observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.saved_values import UNREADABLE, restored
@@ -33,6 +33,10 @@ DISCREPANCY_SHARE = 5e-4
 how large it is, that counts."""
 POSITION_STD = 1e-3
 """Standard deviation of a position sensor's zero [rad]; marginalised like the model's error."""
+DOUBTED = 2
+"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them.
+
+An alarm is open, or the first epoch of the reference."""
 PATIENCE = 2 * LONGEST_WINDOW
 """Repeated poses after an alarm after which the test is given up as undecided: as many as two longest windows have."""
 
@@ -64,8 +68,8 @@ class Observer:
         rated = np.asarray(rated_torque, dtype=float)
         expected = level or DiscrepancyLevel.expected(DISCREPANCY_SHARE * rated)
         belief = GravityBelief(arm, beta, beta_covariance, POSITION_STD, expected, self.config.zero_wander * rated)
-        self._tracking = Tracking(belief, NOISE_SHARE * rated, self.config)
-        self._investigation = Investigation(arm.n, self.config)
+        self._tracking = Tracking(belief, NOISE_SHARE * rated, self.config.window)
+        self._investigation = Investigation(arm.n, self.config.window)
         self._proposed = np.full(arm.n, -np.inf)
         self._limits: tuple[tuple[int, ...], DetectionLimits] | None = None
 
@@ -123,7 +127,7 @@ class Observer:
             return []
         if state.held:
             return self._test(row.t)
-        audit(self._tracking, state, self.config)
+        self._audit()
         return []
 
     def estimate(self) -> Estimate:
@@ -166,17 +170,63 @@ class Observer:
     def _angle(self, position: Array) -> Array:
         return np.asarray(self._position_gain * position + self._position_offset)
 
+    def _adapted(self, rows: list[StaticReading], patient: bool) -> tuple[CauseTest, Verdict]:
+        """The cause test of rows and its verdict; where nothing explains them, again with the discrepancy adapted to
+        them, unless one is still `patient`."""
+        test = self._tracking.cause_test(rows)
+        verdict = test.verdict()
+        if verdict.cause == "unknown" and not patient:
+            self._tracking.belief.adapt(rows, self._tracking.sigma)
+            test = self._tracking.cause_test(rows)
+            verdict = test.verdict()
+        return test, verdict
+
+    def _audit(self) -> None:
+        """Without an alarm, test the last rows for effects too small or too slow for one: an effect opens a silent
+        investigation, rows free of any become reference."""
+        state, tracking = self._investigation, self._tracking
+        window = state.window[-LONGEST_WINDOW:]
+        if not tracking.belief.learnt:
+            if len(window) < self.config.window:
+                return
+            # a change in the newest rows is not discrepancy
+            tracking.belief.adapt(window[: -len(window) // 4], tracking.sigma)
+        # longer than a change takes to fill the window; an alarm would be open if it were a contact
+        patience = DOUBTED if tracking.belief.is_first else LONGEST_WINDOW // AUDIT_ROWS + 1
+        test, verdict = self._adapted(window, state.doubtful + 1 < patience)
+        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
+        if verdict.cause == "none":
+            tracking.follow(test)
+            tracking.belief.learn(state.settled(tracking.belief.is_first), tracking.sigma)
+            return
+        del state.window[:-LONGEST_WINDOW]
+        state.learned = min(state.learned, len(state.window))
+        if verdict.cause not in ("unknown", "ambiguous"):  # an alarm follows if those last
+            state.start(silent=True)
+
+    def _is_confirmed(self, test: CauseTest, verdict: Verdict) -> bool:
+        """Whether fresh rows twice find what an audit was about; nothing is told before."""
+        state = self._investigation
+        if verdict.cause in ("none", "unknown", "ambiguous"):
+            if len(state.window) >= LONGEST_WINDOW:
+                self._resume()
+            return False
+        suspected, state.suspected = state.suspected, ("drift" if verdict.is_drift else verdict.cause, verdict.joints)
+        if suspected == state.suspected:
+            return True
+        state.first = Agreeing(state.window, test, frozenset(verdict.joints)) if verdict.is_drift else None
+        state.window = []
+        return False
+
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state = self._investigation
-        test = self._tracking.cause_test(state.window)
-        if state.silent and test.verdict().cause == "unknown" and may_adapt(self._tracking, state.window, self.config):
-            self._tracking.belief.adapt(state.window, self._tracking.sigma)
-            test = self._tracking.cause_test(state.window)
-        verdict = test.verdict()
+        # more rows than a contact, for which an alarm is open, or none to compare them with, show the discrepancy
+        patient = self._tracking.belief.learnt > 0 and len(state.window) < DOUBTED * self.config.window
+        test, verdict = self._adapted(state.window, patient or not state.silent)
         if verdict.cause == "ambiguous" and len(state.window) < LONGEST_WINDOW:
             return []  # more rows may decide
-        if state.silent and not is_confirmed(self._tracking, state, test, verdict):
+        if state.silent and not self._is_confirmed(test, verdict):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -184,9 +234,7 @@ class Observer:
         if state.doubtful == 1:
             return []  # the cause may have changed within this window: wait for another one
         if state.doubtful > DOUBTED:  # it stays: another discrepancy than the one known
-            self._tracking.belief.adapt(window, self._tracking.sigma)
-            test = self._tracking.cause_test(window)
-            verdict = test.verdict()
+            test, verdict = self._adapted(window, patient=False)
         if verdict.cause == "none":
             self._resume()
             return [self._verdict(t, verdict)]

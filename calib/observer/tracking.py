@@ -12,10 +12,11 @@ import numpy as np
 
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading, batch, stack
-from calib.observer.cause_test import CauseTest, DetectionLimits, limits
-from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
+from calib.observer.cause_test import CauseTest
+from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW
 from calib.observer.decision import DriftFinding
 from calib.observer.discrepancy import PLACE_SIZE
+from calib.observer.evidence import DetectionLimits
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
 from gcomp.arrays import Array, as_array
@@ -33,6 +34,13 @@ class Estimate:
     offset_std: Array
     accepted: Array
     """Rows that went into each."""
+
+    @classmethod
+    def of(cls, change: Array, covariance: Array, accepted: Array) -> "Estimate":
+        """Of changes of gain and offset (n, 2), their covariances (n, 2, 2), and rows (n,)."""
+        gain, offset = change.T
+        gain_std, offset_std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
+        return cls(1 + gain, gain_std, offset.copy(), offset_std, accepted.copy())
 
 
 UNCHANGED = np.array([1.0, 0.0])
@@ -68,10 +76,11 @@ def change_ratios(residual: Array, torque: Array, covariance: Array) -> tuple[Ar
 class Tracking:
     """The gravity model as it is believed, and every joint's sensor against it. Rows have true-angle positions."""
 
-    def __init__(self, belief: GravityBelief, sigma: Array, config: ObserverConfig) -> None:
-        """sigma (n,) [N·m]: standard deviation of one row's torque to begin with, replaced by the measured one."""
+    def __init__(self, belief: GravityBelief, sigma: Array, window: int) -> None:
+        """sigma (n,) [N·m]: standard deviation of one row's torque to begin with, replaced by the measured one; window:
+        rows in which a change is looked for."""
         n = belief.arm.n
-        self.belief, self.sigma, self._config = belief, np.asarray(sigma, dtype=float), config
+        self.belief, self.sigma = belief, np.asarray(sigma, dtype=float)
         self.rows = 0
         """Rows taken."""
         self.state: Array = np.tile(UNCHANGED, (n, 1))
@@ -80,7 +89,7 @@ class Tracking:
         """Of gain and offset (n, 2, 2)."""
         self.accepted = np.zeros(n, dtype=int)
         """Rows that went into each joint's estimate (n,)."""
-        self._latest: deque[StaticReading] = deque(maxlen=config.window)
+        self._latest: deque[StaticReading] = deque(maxlen=window)
 
     def count(self, row: StaticReading) -> bool:
         """Count a row, and average its measured noise into sigma; False if its torque was not steady.
@@ -148,19 +157,22 @@ class Tracking:
         self._latest.clear()
 
     def estimate(self) -> Estimate:
-        gain_std, offset_std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)).T
-        gain, offset = self.state.T.copy()
-        return Estimate(gain, gain_std, offset, offset_std, self.accepted.copy())
+        return Estimate.of(self.state - UNCHANGED, self.covariance, self.accepted)
 
     def limits(self, rows: list[StaticReading]) -> DetectionLimits:
-        """Limits in work like these rows; over the whole range while they are few."""
-        config, belief = self._config, self.belief
-        wait = 0 if belief.level.is_known else max(0, config.window - self.rows)
-        if len(rows) >= config.window:
-            return limits(self.cause_test(rows), config, wait)
-        position = belief.kernel.poses[:LONGEST_WINDOW]
-        anywhere = StaticReadings.of(position, belief.torque(position), self.sigma)
-        return limits(CauseTest(belief, anywhere), config, wait)
+        """Limits in work like these rows; over the whole range while they are few.
+
+        A change is noticed if it stands out of a window of the longest kind, and rows after it confirm it.
+        """
+        belief, window = self.belief, self._latest.maxlen or 0
+        wait = 0 if belief.level.is_known else max(0, window - self.rows)
+        if len(rows) >= window:
+            test = self.cause_test(rows)
+        else:
+            position = belief.kernel.poses[:LONGEST_WINDOW]
+            test = CauseTest(belief, StaticReadings.of(position, belief.torque(position), self.sigma))
+        longer = LONGEST_WINDOW / len(test.window.position)
+        return test.limits(belief.arm.n, wait + LONGEST_WINDOW + 2 * window, longer)
 
     def save(self) -> dict[str, Any]:
         arrays = {name: getattr(self, name).tolist() for name in ("sigma", "state", "covariance", "accepted")}
