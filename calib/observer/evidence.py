@@ -1,6 +1,6 @@
 """The change since the calibration, by the residuals of a window of rows (docs/theory.md, section 6).
 
-Rows at rest and rows of motion have hypotheses of their own (`cause_test.py`, `moving_observer.py`); the test is the same.
+Rows at rest (`cause_test.py`) and of motion (`moving_observer.py`) have hypotheses of their own; the test is the same.
 """
 
 from dataclasses import dataclass, field

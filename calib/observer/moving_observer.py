@@ -17,11 +17,12 @@ import numpy as np
 
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
 from calib.fit.sweep_readings import FEWEST
+from calib.motion.static_reading import StaticReading, stack
 from calib.observer.cause_test import INEXACT
 from calib.observer.config import LONGEST_WINDOW
 from calib.observer.decision import AGREEMENT, DriftFinding, Event, verdict_evidence
 from calib.observer.evidence import ChangeTest, DetectionLimits
-from calib.observer.motor_belief import MotorBelief, Passage, PassageDetector
+from calib.observer.motor_belief import MotorBelief, PassageDetector, read_passages, save_passages
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -40,12 +41,11 @@ class MotionTest(ChangeTest):
     far beyond."""
     sensor_std = 10 * ChangeTest.sensor_std
 
-    def __init__(self, belief: MotorBelief, passages: Sequence[Passage]) -> None:
+    def __init__(self, belief: MotorBelief, passages: Sequence[StaticReading]) -> None:
         """Rows after those that the belief rests on."""
         self._belief, self._passages = belief, passages
         residual, jacobian, covariance = belief.linearised(passages)
-        joint = np.array([each.joint for each in passages])
-        found = ResidualTest(residual, covariance, _candidates(belief, jacobian, joint))
+        found = ResidualTest(residual, covariance, _candidates(belief, jacobian, stack(passages, "joint")))
         super().__init__(found, len(passages) / (len(belief.learnt) + USUAL_ROWS), INEXACT)
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
@@ -112,8 +112,8 @@ class MovingObserver:
         self.arm, self._angle = arm, calibration.angle
         self._detector = PassageDetector(arm.n)
         self._belief = MotorBelief(arm, calibration, gravity, np.asarray(rated_torque, dtype=float))
-        self._block: list[Passage] = []
-        self._recent: list[Passage] = []
+        self._block: list[StaticReading] = []
+        self._recent: list[StaticReading] = []
         self._count = np.zeros(arm.n, dtype=int)
         self._agreeing: tuple[str, int | None] = ("none", None)
         self._reported: tuple[str, int | None, Array] = ("none", None, np.empty(0))
@@ -140,9 +140,9 @@ class MovingObserver:
             events += self.handle_row(passage)
         return events
 
-    def handle_row(self, passage: Passage) -> list[Event]:
+    def handle_row(self, passage: StaticReading) -> list[Event]:
         """Take one row, with true angles."""
-        self._count[passage.joint] += 1
+        self._count += np.arange(self.arm.n) == passage.joint
         self._block.append(passage)
         if len(self._block) < LONGEST_WINDOW:
             return []
@@ -192,7 +192,7 @@ class MovingObserver:
     def save(self) -> dict[str, Any]:
         """The rows that the belief rests on, and those since, as JSON values."""
         rows = {"learnt": self._belief.learnt, "block": self._block, "recent": self._recent}
-        saved: dict[str, Any] = {name: [each.to_json() for each in some] for name, some in rows.items()}
+        saved: dict[str, Any] = {name: save_passages(some) for name, some in rows.items()}
         cause, joint, values = self._reported
         return {"schema": SCHEMA, "count": self._count.tolist(), "reported": [cause, joint, values.tolist()], **saved}
 
@@ -201,9 +201,7 @@ class MovingObserver:
         try:
             if values["schema"] != SCHEMA:
                 return False
-            learnt, block, recent = (
-                [Passage.from_json(each, n) for each in values[name]] for name in ("learnt", "block", "recent")
-            )
+            learnt, block, recent = (read_passages(values[name], n) for name in ("learnt", "block", "recent"))
             count = np.array(values["count"], dtype=int)
             cause, joint, size = values["reported"]
             reported = str(cause), joint, as_array("reported", np.array(size, dtype=float), (None,))
