@@ -1,0 +1,133 @@
+"""Which of several changes explains residuals of known covariance: least squares of each, compared by BIC."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from gcomp.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeHypothesis:
+    """A change, as what it does to the readings."""
+
+    cause: str
+    joint: int | None
+    """Index of the joint; None if it concerns the whole arm."""
+    columns: Array
+    """Change of the K residuals per unit of each parameter (K, p)."""
+    price: int | None = None
+    """Parameters charged in the BIC; by default the number of columns."""
+
+    @property
+    def parameters(self) -> int:
+        return self.columns.shape[1] if self.price is None else self.price
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeFit:
+    """Hypotheses fitted together."""
+
+    hypothesis: ChangeHypothesis
+    """The first of them."""
+    bic: float
+    chi2: float
+    values: Array
+    """Parameters of all of them (p,)."""
+    covariance: Array
+    """(p, p); 0 for parameters that the rows do not show."""
+    shown: int
+    """Number of independent parameters that the rows show."""
+
+
+class ResidualTest:
+    """Residuals of K rows with what they have in common, and the hypotheses that may explain them."""
+
+    def __init__(self, residual: Array, covariance: Array, hypotheses: Sequence[ChangeHypothesis]) -> None:
+        """residual (K,), covariance (K, K) to expect of it where nothing has changed."""
+        self.hypotheses = tuple(hypotheses)
+        self.places = {(each.cause, each.joint): place for place, each in enumerate(hypotheses)}
+        """Cause and joint of each hypothesis → its number."""
+        self._root = np.linalg.cholesky(covariance)
+        white = self.whitened(np.column_stack([residual, *(each.columns for each in hypotheses)]))
+        self.residual: Array = white[:, 0]
+        """Whitened."""
+        ends = np.cumsum([1, *(each.columns.shape[1] for each in hypotheses)])
+        self.columns: list[Array] = [white[:, begin:end] for begin, end in pairwise(ends)]
+        """Whitened, of each hypothesis."""
+        self.chi2 = float(self.residual @ self.residual)
+        """Where nothing has changed."""
+
+    def whitened(self, columns: Array) -> Array:
+        white: Array = np.linalg.solve(self._root, columns)  # scipy takes longer to load
+        return white
+
+    def fit(self, *indices: int) -> ChangeFit:
+        columns = np.hstack([self.columns[index] for index in indices])
+        return self.fit_columns([self.hypotheses[index] for index in indices], columns, self.residual)
+
+    @staticmethod
+    def fit_columns(together: Sequence[ChangeHypothesis], columns: Array, target: Array) -> ChangeFit:
+        """Likewise with whitened columns (K, p) and a whitened target (K,) of their own."""
+        u, s, vt, size = _decomposed(columns)
+        kept = s > 0
+        back = (vt[kept].T / s[kept]) / size[:, None]
+        explained = u[:, kept].T @ target
+        covariance, shown = back @ back.T, int(kept.sum())
+        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
+        covariance[hidden] = covariance[:, hidden] = 0.0
+        chi2 = float(target @ target) - float(explained @ explained)
+        price = sum(each.parameters for each in together) - (columns.shape[1] - shown)
+        bic = chi2 + price * float(np.log(len(target)))
+        return ChangeFit(together[0], bic, chi2, back @ explained, covariance, shown)
+
+    def misfit(self, chi2: float, parameters: int, doubt: float) -> float:
+        """χ² above its degrees of freedom, in standard deviations; `doubt`: relative variance of what is expected."""
+        free = max(len(self.residual) - parameters, 1)
+        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + doubt))), 2)
+
+    def noticed(self, index: int, rivals: Iterable[int], needed: float) -> float:
+        """Size of a hypothesis' change that wins in one case of two by a BIC of `needed`: over none, and all rivals."""
+        bases = ((self._bases[rival], self.hypotheses[rival].parameters) for rival in rivals)
+        return smallest_noticed_change(self.columns[index][:, 0], bases, needed)
+
+    @cached_property
+    def _bases(self) -> list[Array]:
+        return [span(columns) for columns in self.columns]
+
+
+def distance(change: Array, covariance: Array) -> float:
+    """Square of a change's length (p,) in standard deviations, over the parameters that rows show."""
+    known = np.diag(covariance) > 0
+    part = change[known]
+    return float(part @ np.linalg.pinv(covariance[np.ix_(known, known)]) @ part)
+
+
+def span(columns: Array) -> Array:
+    """An orthonormal basis (K, r) of whitened columns (K, p), of which r are independent."""
+    u, s, _, _ = _decomposed(columns)
+    return u[:, s > 0]
+
+
+def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
+    """u, s, vt of columns (K, p) in units of their lengths, and these; s is 0 where columns depend on others."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size <= 1e-9] = 1.0
+    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
+    return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
+
+
+def smallest_noticed_change(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
+    """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
+
+    Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
+    """
+    size, once = float(own @ own), float(np.log(len(own)))
+    needed = evidence + once
+    for basis, price in rivals if size > 0 else ():
+        alike = float(((basis.T @ own) ** 2).sum()) / size
+        needed = max(needed, (evidence - (price - 1) * once) / max(1 - alike, 1e-9))
+    return float(np.sqrt(needed / max(size, 1e-30)))
