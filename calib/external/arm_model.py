@@ -1,7 +1,7 @@
 """The model of external torque of an arm: from its records, or from a model file alone, and its own work."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.load import bar_inertials
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
-from gcomp.external.external_model import ExternalModel, from_records, learn
+from gcomp.external.external_model import ExternalModel, Prior, from_records, learn
 from gcomp.external.filtered_rows import Samples
 from gcomp.external.rigid_motion import INERTIAL
 
@@ -48,8 +48,14 @@ class ArmRecords:
         links[:, [4, 7, 9]] = (mass * (np.linalg.norm(arm.span, axis=1) ** 2 + 0.01) / 3.0)[:, None]
         return links
 
-    def angle(self, reading: Array) -> Array:
-        return reading if self.calibration is None else self.calibration.angle(reading)
+    def true_angles(self, recording: Recording) -> Recording:
+        """Positions are recorded as the sensors read them."""
+        if self.calibration is None:
+            return recording
+        velocity = recording.velocity
+        if velocity is not None:
+            velocity = velocity * self.calibration.values("position_gain", 1.0)
+        return replace(recording, position=self.calibration.angle(recording.position), velocity=velocity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +63,13 @@ class Listener:
     """What turns recordings of one arm into samples of its model."""
 
     model: ExternalModel
+    records: ArmRecords
     channel: str
     rate: float
     warm: Array | None
 
     def samples(self, recording: Recording) -> list[tuple[Array, Samples]]:
-        return even_samples(recording, self.channel, self.rate, self.warm)
+        return even_samples(self.records.true_angles(recording), self.channel, self.rate, self.warm)
 
 
 def channel_of(recordings: Sequence[Recording]) -> str:
@@ -85,18 +92,25 @@ def listener_of(
     channel = channel or channel_of(every)
     rate = rate_of(every)
     warm = _usual_temperature(baselines or recordings)
-    runs = [samples for each in baselines for _, samples in even_samples(each, channel, rate, warm)]
-    scale = _scale(records, runs or [s for each in recordings for _, s in even_samples(each, channel, rate, warm)])
-    motor = channel != "torque"
-    links = records.links
-    prior = prior_of_model(arm, links, MOTOR if motor else LINK, scale)
+
+    def samples(some: Sequence[Recording]) -> list[Samples]:
+        return [part for each in some for _, part in even_samples(records.true_angles(each), channel, rate, warm)]
+
+    runs = samples(baselines)
+    scale = _scale(records, runs or samples(recordings))
+    prior = prior_of(records, channel, scale)
+    model = learn(arm, prior, runs, rate, scale) if runs else from_records(arm, prior, scale)
+    return Listener(model, records, channel, rate, warm)
+
+
+def prior_of(records: ArmRecords, channel: str, scale: Array) -> Prior:
+    """Before any work of the arm's own; `scale` (n,) [N·m] is that of its joints' torques."""
+    arm, links = records.stated.arm, records.links
+    prior = prior_of_model(arm, links, LINK if channel == "torque" else MOTOR, scale)
     if records.gravity is not None:
         own = base_parameters(arm, links[:, 0], links[:, 1:4])
         prior = with_gravity(prior, arm, records.gravity, own)
-    if records.calibration is not None:
-        prior = with_calibration(prior, records.calibration)
-    model = learn(arm, prior, runs, rate, scale) if runs else from_records(arm, prior, scale)
-    return Listener(model, channel, rate, warm)
+    return prior if records.calibration is None else with_calibration(prior, records.calibration)
 
 
 def _scale(records: ArmRecords, runs: Sequence[Samples]) -> Array:
