@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
+from gcomp.arm.inertials import body_parameters
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arm.model_file import NotXml, parse_xml, upwards
 from gcomp.arrays import Array, as_array
@@ -284,6 +285,17 @@ def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
         if link is not None:
             link_of[body] = link
     return link_of
+
+
+def bar_inertials(placed: PlacedChain) -> Array:
+    """Ten inertial parameters of each link about its bar frame's origin, in the bar frame (n, 10)."""
+    geometry, found = placed.geometry, np.zeros((placed.arm.arm.n, 10))
+    for link, bodies in enumerate(placed.bodies):
+        for body in bodies:
+            turn = placed.data.xmat[body].reshape(3, 3)
+            origin = turn.T @ (geometry.origins[link] - placed.data.xpos[body])
+            found[link] += body_parameters(placed.model, body, origin, geometry.bar[link].T @ turn)
+    return found
 
 
 def joint_inertias(placed: PlacedChain, poses: Array, mass: float = 0.0) -> Array:

@@ -1,0 +1,176 @@
+"""Tells torque and force that the surroundings exert on an arm, with bounds, and contacts as events."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from armlink.commands.options import reads_recordings
+from calib.commands.options import JsonFile, Store, Tool
+
+if TYPE_CHECKING:
+    from armlink.recording.corrections import Corrections
+    from calib.external.arm_model import ArmRecords
+    from calib.external.listening import Frame, Heard
+
+
+@reads_recordings
+def external(
+    arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
+    recordings: Annotated[list[str], typer.Argument(help="Recordings to judge.")],
+    stated: "Corrections",
+    baseline: Annotated[
+        list[str] | None,
+        typer.Option(help="Recording of the arm's own work without contact, to learn from; may be repeated."),
+    ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JOINT[,X,Y,Z]",
+            help="Where the wrench is told: a point [m] in the frame that turns with this joint. By default the centre "
+            "of the tool, or of the last link.",
+        ),
+    ] = None,
+    false_alarms: Annotated[str, typer.Option(help="Rate of contacts that there were none: 1/h, 2/d.")] = "1/h",
+    out: Annotated[
+        Path | None, typer.Option(help="Write torques, bounds and wrench over time: .csv, or .mcap for ROS 2.")
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Body of the model file that carries the chain; by default the world.")
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="Last body of the chain in the model file; by default the last body that moves.")
+    ] = None,
+    tool: Tool = None,
+    store: Store = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Tell what torque neither arm, tool nor friction explains, with 95 % bounds, and what touches the arm.
+
+    Without --baseline, bounds come from the arm's records alone.
+
+    Example: armlink external arm.yaml run.mcap --baseline free.mcap
+    """
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole, results
+    from armlink.recording.files import load_recordings
+    from calib.external.arm_model import listener_of
+    from calib.external.listening import listen
+    from calib.external.tables import answer_of, save_heard
+
+    per_hour = parse_rate(false_alarms)
+    records = _records(arm, base, tip, tool, store)
+    judged = {label: each for path in recordings for label, each in load_recordings(path, stated).items()}
+    free = [each for path in baseline or [] for each in load_recordings(path, stated).values()]
+    listener = listener_of(records, free, list(judged.values()))
+    place = parse_frame(frame, records)
+    console, answers = results(json_file), []
+    every: list[Heard] = []
+    if not free:
+        PlainConsole().print(
+            "bounds by the records alone, proved by no work of the arm: give recordings without contact as --baseline",
+            style="yellow",
+        )
+    names = records.stated.arm.names
+    for label, recording in judged.items():
+        heard = list(listen(listener, recording, place, per_hour))
+        every += heard
+        answers.append(answer_of(label, heard, names))
+        _tell(console, answers[-1], names)
+    if out is not None:
+        save_heard(out, every, names)
+    write_json(
+        json_file,
+        {
+            "schema": "armlink.external/1",
+            "joints": list(names),
+            "channel": listener.channel,
+            "baseline_s": listener.model.seconds,
+            "false_alarms_per_hour": per_hour,
+            "frame": {"joint": names[place.link], "point": place.point.tolist()},
+            "recordings": answers,
+        },
+    )
+
+
+def parse_rate(text: str) -> float:
+    """Events an hour of `1/h` or `2/d`; raises BadInput."""
+    from armlink.errors import BadInput
+
+    number, _, unit = text.partition("/")
+    hours = {"h": 1.0, "d": 24.0, "min": 1.0 / 60.0}
+    try:
+        rate = float(number) / hours[unit]
+    except (ValueError, KeyError):
+        rate = float("nan")
+    if not 0.0 < rate <= 600.0:
+        raise BadInput(f"--false-alarms {text}: expected a rate such as 1/h or 2/d, at most 10/min")
+    return rate
+
+
+def parse_frame(text: str | None, records: "ArmRecords") -> "Frame":
+    """The frame of an option `--frame`; raises BadInput."""
+    import numpy as np
+
+    from armlink.errors import BadInput
+    from calib.external.listening import Frame
+
+    arm, file = records.stated.arm, records.stated.arm_file
+    if text is None:
+        if file is not None and file.tool is not None:
+            return Frame(arm.n - 1, np.array(file.tool.centre))
+        last = records.links[-1]
+        return Frame(arm.n - 1, last[1:4] / last[0] if last[0] > 0.0 else np.zeros(3))
+    name, *numbers = text.split(",")
+    try:
+        point = np.array([float(each) for each in numbers])
+    except ValueError:
+        point = np.empty(1)
+    if name not in arm.names or len(point) not in (0, 3) or not np.isfinite(point).all():
+        known = ", ".join(arm.names)
+        raise BadInput(f"--frame {text}: expected JOINT or JOINT,X,Y,Z with one of the joints {known}")
+    return Frame(arm.names.index(name), point if len(point) else np.zeros(3))
+
+
+def _records(arm: str, base: str | None, tip: str | None, tool: str | None, store: str | None) -> "ArmRecords":
+    from calib.arm.stated_model import stated_model
+    from calib.external.arm_model import ArmRecords
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import RecordStore
+
+    stated = stated_model(arm, base, tip, tool)
+    if stated.arm_file is None:
+        return ArmRecords(stated)
+    kept = RecordStore(store)
+    gravity = kept.current(GravityRecord, stated.arm_file)
+    return ArmRecords(
+        stated,
+        kept.current(CalibrationRecord, stated.arm_file),
+        None if gravity is None else gravity.carrying(stated.arm_file),
+    )
+
+
+def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
+    from rich.table import Table
+
+    table = Table(
+        "joint", "external torque, RMS [N·m]", "95 % bound ± [N·m]", "at rest ± [N·m]", title=answer["recording"]
+    )
+    for name, rms, bound, rest in zip(names, answer["rms"], answer["bound"], answer["bound_at_rest"], strict=True):
+        table.add_row(name, *("–" if x is None else f"{x:.3f}" for x in (rms, bound, rest)))
+    console.print(table)
+    best, worst = answer["smallest_force"]
+    far = "not determined" if worst is None else f"{worst:.1f} N"
+    console.print(
+        f"{answer['seconds']:.1f} s; smallest force found at the frame: {best:.1f} N along the best direction, "
+        f"{far} along the worst"
+    )
+    for event in answer["events"]:
+        where = f"{event['t']:9.2f} s  {event['kind']}"
+        if event["kind"] == "contact":
+            told = f"at link {event['link']} ({event['probability']:.0%}), at least {event['least_force']:.1f} N"
+        else:
+            told = f"{event['mass']:+.2f} kg"
+        console.print(f"{where}  {told}; joints {', '.join(event['joints'])}")
+    if not answer["events"]:
+        console.print("no contact")

@@ -1,0 +1,81 @@
+"""External torque, wrench and contacts of recordings, row by row."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from armlink.recording.recording import Recording
+from calib.external.arm_model import Listener
+from gcomp.arrays import Array
+from gcomp.external.contact import ContactDetector, ContactEvent, Judged
+from gcomp.external.external_model import CHUNK
+from gcomp.external.wrench import Wrench, smallest_force, wrench
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where a wrench is told: a point of a link's bar frame."""
+
+    link: int
+    point: Array
+    """(3,) [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """One stretch of a recording."""
+
+    t: Array
+    """(S,) [s]."""
+    position: Array
+    """(S, n) [rad]."""
+    judged: Judged
+    wrench: Wrench
+    least_force: tuple[Array, Array]
+    """Force at the frame that would be found [N], along the direction felt best and the one felt worst (S,)."""
+    events: list[ContactEvent]
+    load: Array
+    """Mass [kg] and first moment [kg·m] that the arm was found to carry at the end (4,)."""
+
+
+def listen(listener: Listener, recording: Recording, frame: Frame, per_hour: float) -> Iterator[Heard]:
+    """Each stretch of a recording without a gap is judged on its own."""
+    model = listener.model
+    for t, samples in listener.samples(recording):
+        made, detector = model.filter(listener.rate), ContactDetector(model, per_hour, frame.point)
+        parts = []
+        for begin in range(0, len(samples), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            filtered = made.rows(samples.part(part))
+            rows, when = model.rows(filtered), t[part][filtered.chosen]
+            judged, events = detector.judge(when, rows)
+            motion, spread = filtered.motion, model.lasting
+            told = wrench(motion, frame.link, frame.point, judged.external, judged.std, spread.correlation)
+            least = smallest_force(
+                model, detector.sudden_limit, motion, frame.link, frame.point, judged.change_std, model.sudden
+            )
+            parts.append((when, samples.position[part][filtered.chosen], judged, told, least, events))
+        yield Heard(
+            _joined([each[0] for each in parts]),
+            _joined([each[1] for each in parts]),
+            Judged(*(_joined([getattr(each[2], name) for each in parts]) for name in Judged.__dataclass_fields__)),
+            _joined_wrench([each[3] for each in parts]),
+            (_joined([each[4][0] for each in parts]), _joined([each[4][1] for each in parts])),
+            [event for each in parts for event in each[5]],
+            detector.load,
+        )
+
+
+def _joined_wrench(parts: list[Wrench]) -> Wrench:
+    return Wrench(
+        _joined([each.value for each in parts]),
+        _joined([each.covariance for each in parts]),
+        np.concatenate([each.determined for each in parts]),
+        _joined([each.force for each in parts]),
+        _joined([each.force_std for each in parts]),
+    )
+
+
+def _joined(parts: list[Array]) -> Array:
+    return np.concatenate(parts)

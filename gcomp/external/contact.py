@@ -1,0 +1,314 @@
+"""Contacts as events: from when, on which link, how strong at least; and loads that are taken up or put down.
+
+The deviation of all joints' rows from what is expected is compared with its largest values in stretches of the arm's
+own work: their extreme value distribution gives the threshold for any rate of false alarms. What pushes is then the
+hypothesis that explains the change best: a force at a point of some link, or a mass at the hand.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from gcomp.external.external_model import BEGINNING, BLOCK, ROWS_RATE, SLOW, ExternalModel, Rows
+from gcomp.external.rigid_motion import INERTIAL, RigidMotion, jacobian
+
+FEWEST_MAXIMA = 5
+"""Stretches from which a threshold is taken; with fewer, deviations count as normally distributed."""
+HEAVIEST = 0.3
+"""Largest shape of the extreme value distribution: a choice, as few stretches do not tell it."""
+ONE_SIDED_95 = 1.644854
+DECIDED = 4
+"""Rows until an event's cause is decided: 0.16 s, four time constants of the observer."""
+BEGINNING_ROWS = round(BEGINNING * ROWS_RATE)
+"""Rows that are not judged: the filter begins with them."""
+ENDED = 0.5
+"""Share of the threshold below which an event ends."""
+ENDED_ROWS = 8
+"""For so many rows in a row."""
+LASTING_ROWS = 75
+"""Rows after which what still pushes is a load, if that explains it, or belongs to what the arm carries: 3 s."""
+POINTS = (0.0, 0.5, 1.0)
+"""Places of a contact between a link's joint and the next one."""
+FORCES = np.geomspace(0.5, 200.0, 8)
+"""Standard deviations of a contact's force before it is seen [N]."""
+MASSES = np.geomspace(0.05, 20.0, 8)
+"""The same of a load's mass [kg]."""
+LOAD_REACH = 0.15
+"""The same of the place of its centre from the tool's [m]."""
+WIDTH = 0.06
+"""Half the width of a link [m], which adds to the lever of a force."""
+
+
+@dataclass(frozen=True)
+class ContactEvent:
+    """What begins to push the arm, or ends to."""
+
+    t: float
+    """When it began [s]."""
+    kind: str
+    """`contact`, `load`, `load put down`."""
+    joints: tuple[int, ...]
+    """Those whose torque it changes beyond what is expected, the most certain first."""
+    link: int
+    """The likeliest link, from 0."""
+    probability: float
+    """Of that link, given a contact."""
+    odds: float
+    """Logarithm of the likelihood of a contact over that of a load."""
+    least_force: float
+    """95 % lower bound of its force [N], wherever it acts; 0 of a load."""
+    mass: float
+    """Of a load [kg]; 0 of a contact."""
+    told: float
+    """When it was decided [s]."""
+
+
+def threshold(maxima: Array, per_hour: float, joints: int) -> float:
+    """Deviation that the arm's own work exceeds so often.
+
+    Generalised extreme values by probability-weighted moments (Hosking, Wallis and Wood, Technometrics 27, 1985).
+    """
+    from scipy.special import gamma
+    from scipy.stats import chi2
+
+    share = min(per_hour * BLOCK / 3600.0, 0.5)
+    if len(maxima) < FEWEST_MAXIMA:
+        return float(chi2.isf(share / (BLOCK * ROWS_RATE), joints))
+    x = np.sort(maxima)
+    count = len(x)
+    rank = np.arange(count)
+    b0, b1 = float(x.mean()), float((rank * x).sum() / (count * (count - 1)))
+    b2 = float((rank * (rank - 1) * x).sum() / (count * (count - 1) * (count - 2)))
+    c = (2.0 * b1 - b0) / (3.0 * b2 - b0) - np.log(2.0) / np.log(3.0)
+    shape = float(np.clip(7.859 * c + 2.9554 * c**2, -HEAVIEST, -1e-3))  # Hosking's sign: negative is heavy
+    scale = (2.0 * b1 - b0) * shape / (gamma(1.0 + shape) * (1.0 - 2.0**-shape))
+    place = b0 + scale * (gamma(1.0 + shape) - 1.0) / shape
+    return float(place + scale / shape * (1.0 - (-np.log1p(-share)) ** shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Rows beside what is expected of them."""
+
+    external: Array
+    """External torque (S, n) [N·m]: what the surroundings push the joints with."""
+    std: Array
+    """(S, n) [N·m]."""
+    change_std: Array
+    """Of its change (S, n) [N·m]."""
+    deviation: Array
+    """Of all joints, (S,)."""
+
+
+class ContactDetector:
+    """Judges rows one after the other."""
+
+    def __init__(self, model: ExternalModel, per_hour: float = 1.0, tool: Array | None = None) -> None:
+        """`tool` (3,) is the point of the last bar frame at which loads are held [m]."""
+        self.model = model
+        n = model.arm.n
+        self.tool = np.zeros(3) if tool is None else tool
+        self.lasting_limit, self.sudden_limit = (threshold(each, per_hour / 2.0, n) for each in model.maxima)
+        self._lasting_inverse = np.linalg.inv(model.lasting.correlation)
+        self._sudden_inverse = np.linalg.inv(model.sudden.correlation)
+        back = np.linalg.inv(model.split)
+        self._load_columns = back[:, INERTIAL * (n - 1) : INERTIAL * (n - 1) + 4]
+        self.load = np.zeros(4)
+        """Mass [kg] and first moment [kg·m] of what the arm has taken up since."""
+        self._slow: Array | None = None
+        self._slow_columns: list[Array] | None = None
+        self._seen = 0
+        self._open: _Open | None = None
+
+    def judge(self, t: Array, rows: Rows) -> tuple[Judged, list[ContactEvent]]:
+        """Rows at times (S,) [s]."""
+        model, events = self.model, list[ContactEvent]()
+        own = model.model_variance(rows)
+        std = model.lasting.std(rows.state, own)
+        left = -rows.left
+        loaded = -(rows.by_link @ self._load_columns)
+        external, deviation, change_std = np.empty_like(left), np.empty(len(left)), np.empty_like(left)
+        for row in range(len(left)):
+            external[row] = left[row] - loaded[row] @ self.load
+            scaled = external[row] / std[row]
+            deviation[row] = scaled @ self._lasting_inverse @ scaled
+            change_std[row] = self._change_std(rows, row)
+            events += self._row(
+                float(t[row]),
+                external[row],
+                std[row],
+                change_std[row],
+                float(deviation[row]),
+                loaded[row],
+                rows.motion,
+                row,
+            )
+        return Judged(external, std, change_std, deviation), events
+
+    def _change_std(self, rows: Rows, row: int) -> Array:
+        """Standard deviation of a row's change since before (n,) [N·m]; what it was before goes on with it."""
+        columns = [rows.by_link[row], rows.by_joint[row]]
+        if self._slow_columns is None:
+            self._slow_columns = columns
+        away = [now - before for now, before in zip(columns, self._slow_columns, strict=True)]
+        change = Rows(rows.left[row][None], away[0][None], away[1][None], rows.state[row][None], rows.motion)
+        if self._open is None:
+            share = self._share()
+            self._slow_columns = [b + share * a for a, b in zip(away, self._slow_columns, strict=True)]
+        std = self.model.sudden.std(change.state, self.model.model_variance(change))
+        return np.asarray(std[0])
+
+    def _share(self) -> float:
+        """Weight of a row in the mean of what was before."""
+        return max(float(1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))), 1.0 / max(self._seen - BEGINNING_ROWS, 1))
+
+    def _row(
+        self, t: float, external: Array, std: Array, change_std: Array, deviation: float, loaded: Array,
+        motion: RigidMotion, row: int,
+    ) -> Iterator[ContactEvent]:  # fmt: skip
+        self._seen += 1
+        if self._seen <= BEGINNING_ROWS:
+            self._slow_columns = None
+            return
+        if self._slow is None:
+            self._slow = external.copy() if deviation < self.lasting_limit else 0.0 * external
+        change = (external - self._slow) / change_std
+        sudden = float(change @ self._sudden_inverse @ change)
+        if self._open is None:
+            begun = self._seen > 2 * BEGINNING_ROWS
+            if deviation > self.lasting_limit or (begun and sudden > self.sudden_limit):
+                by_change = begun and sudden / self.sudden_limit >= deviation / self.lasting_limit
+                self._open = _Open(t, self._slow.copy() if by_change else 0.0 * external, by_change)
+            else:
+                self._slow = self._slow + self._share() * (external - self._slow)
+        opened = self._open
+        if opened is not None:
+            yield from self._follow(opened, t, external, change_std if opened.by_change else std, loaded, motion, row)
+            quiet = deviation < ENDED * self.lasting_limit and sudden < ENDED * self.sudden_limit
+            opened.quiet = opened.quiet + 1 if quiet else 0
+            lasted = len(opened.rows) >= 2 * LASTING_ROWS and deviation < self.lasting_limit
+            if self._open is opened and (lasted or opened.quiet >= ENDED_ROWS):
+                self._open, self._slow, self._slow_columns = None, external.copy(), None
+
+    def _follow(
+        self, opened: "_Open", t: float, external: Array, std: Array, loaded: Array, motion: RigidMotion, row: int
+    ) -> Iterator[ContactEvent]:
+        opened.rows.append((external - opened.before, std, loaded))
+        count = len(opened.rows)
+        if count == DECIDED:
+            event = self._decide(opened, t, motion, row)
+            opened.event = event
+            yield event
+        if count == LASTING_ROWS and opened.event is not None:
+            taken = self._load(opened)
+            if taken is not None:
+                before, self.load = self.load, self.load + taken
+                self._open, self._slow, self._slow_columns = None, external - loaded @ taken, None
+                kind = "load" if self.load[0] > before[0] else "load put down"
+                if opened.event.kind != kind:
+                    yield replace(opened.event, kind=kind, mass=float(taken[0]), told=t, least_force=0.0)
+
+    def _decide(self, opened: "_Open", t: float, motion: RigidMotion, row: int) -> ContactEvent:
+        recent = opened.rows[-2:]
+        change, std = np.mean([each[0] for each in recent], axis=0), recent[-1][1]
+        spread = self.model.sudden if opened.by_change else self.model.lasting
+        covariance = spread.correlation * np.outer(std, std)
+        here = motion.part(slice(row, row + 1))
+        by_link = np.array([contact_likelihood(self.model, here, link, change, covariance) for link in range(len(std))])
+        weight = np.exp(by_link - by_link.max())
+        link = int(np.argmax(by_link))
+        likelihood, load = load_likelihood(recent[-1][2], self.tool, change, covariance)
+        size = np.abs(change) / std
+        order = np.argsort(-size)
+        odds = float(by_link.max() + np.log(weight.mean()) - likelihood)
+        kind = "contact" if odds > 0.0 else "load" if load > 0 else "load put down"
+        lever = levers(self.model, here, self.tool)
+        least = float(np.max((np.abs(change) - ONE_SIDED_95 * std) / lever))
+        is_load = kind != "contact"
+        return ContactEvent(
+            opened.t, kind, tuple(int(j) for j in order if size[j] > ONE_SIDED_95) or (int(order[0]),), link,
+            float(weight[link] / weight.sum()), odds, 0.0 if is_load else max(least, 0.0), load if is_load else 0.0, t,
+        )  # fmt: skip
+
+    def _load(self, opened: "_Open") -> Array | None:
+        """Load (4,) that explains all rows of an event, if one does."""
+        change, std, columns = (np.array(each) for each in zip(*opened.rows, strict=True))
+        change, std, columns = change[DECIDED:], std[DECIDED:], columns[DECIDED:]
+        white = (columns / std[..., None]).reshape(-1, 4)
+        wanted = (change / std).ravel()
+        normal = white.T @ white / ROWS_RATE + np.diag(1.0 / (np.array([5.0, *[5.0 * LOAD_REACH] * 3]) ** 2))
+        found = np.linalg.solve(normal, white.T @ wanted / ROWS_RATE)
+        left = (wanted - white @ found).reshape(len(change), -1)
+        inverse = self._sudden_inverse if opened.by_change else self._lasting_inverse
+        limit = self.sudden_limit if opened.by_change else self.lasting_limit
+        misfit = float(np.mean(np.einsum("si,ij,sj->s", left, inverse, left)))
+        reach = np.linalg.norm(found[1:]) / max(abs(found[0]), 1e-9)
+        possible = self.load[0] + found[0] > -0.3 * abs(found[0]) and reach < 3.0 * LOAD_REACH + np.linalg.norm(
+            self.tool
+        )
+        return found if misfit < ENDED * limit and possible else None
+
+
+@dataclass
+class _Open:
+    """An event that goes on."""
+
+    t: float
+    before: Array
+    """External torque before it (n,)."""
+    by_change: bool
+    rows: list[tuple[Array, Array, Array]] = None  # type: ignore[assignment]
+    quiet: int = 0
+    event: ContactEvent | None = None
+
+    def __post_init__(self) -> None:
+        self.rows = []
+
+
+def contact_likelihood(model: ExternalModel, motion: RigidMotion, link: int, change: Array, covariance: Array) -> float:
+    """Logarithm of the likelihood of a change (n,) by a force of unknown size and direction on a link."""
+    n = model.arm.n
+    found = []
+    for share in POINTS:
+        point = share * model.arm.span[link] if link < n - 1 else share * np.array([0.0, 0.0, 0.1])
+        pull = jacobian(motion, link, point)[0, :3].T
+        found += [_normal(change, covariance + size**2 * pull @ pull.T) for size in FORCES]
+    return float(max(found))
+
+
+def load_likelihood(columns: Array, tool: Array, change: Array, covariance: Array) -> tuple[float, float]:
+    """(Logarithm of the likelihood of a change by a load, its mass [kg]); columns (n, 4) of mass and first moment."""
+    at_tool = columns[:, 0] + columns[:, 1:] @ tool
+    reach = columns[:, 1:] * LOAD_REACH
+    best = max(
+        (
+            (_normal(change, covariance + size**2 * (np.outer(at_tool, at_tool) + reach @ reach.T)), size)
+            for size in MASSES
+        ),
+        key=lambda each: each[0],
+    )
+    likelihood, size = best
+    inner = covariance + size**2 * reach @ reach.T
+    weighted = np.linalg.solve(inner, at_tool)
+    mass = float(weighted @ change / (weighted @ at_tool + size**-2))
+    return likelihood, mass
+
+
+def levers(model: ExternalModel, motion: RigidMotion, tool: Array) -> Array:
+    """Longest lever (n,) [m] about each joint that a force on the links beyond it has at one pose."""
+    tip = motion.origin[0, -1] + motion.rotation[0, -1] @ tool
+    points = np.vstack([motion.origin[0], tip])
+    out = np.empty(model.arm.n)
+    for j in range(model.arm.n):
+        away = points[j:] - motion.origin[0, j]
+        axis = motion.screw[0, j, :3]
+        out[j] = np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max() + WIDTH
+    return out
+
+
+def _normal(x: Array, covariance: Array) -> float:
+    factor = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(factor, x)
+    return float(-0.5 * white @ white - np.log(np.diag(factor)).sum())

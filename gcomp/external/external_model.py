@@ -1,0 +1,404 @@
+"""What an arm's torque is without contact, learned from the arm's own work: mean, covariance, and how often it strays.
+
+The rows of `gcomp.external.filtered_rows` are linear in the parameters, which have a prior (the records, or the model
+with what sound arms lack) and are narrowed by recordings without contact. What is left over is judged by rows that the
+fit has not seen. Its variance is a sum of components (at rest, at speed, while friction turns round, where the model is
+not known), whose sizes are those of maximum likelihood.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
+from gcomp.external.filtered_rows import JOINT_COLUMNS, FilteredRows, RowFilter, Samples
+from gcomp.external.rigid_motion import INERTIAL, RigidMotion, gravity_split
+
+NORMAL_95 = 1.959964
+ROWS_RATE = 25.0
+"""Rows a second [Hz]: as fast as the observer's bandwidth lets torque change."""
+FOLDS = 8
+ROUNDS = 3
+CHUNK = 2000
+"""Samples at a time."""
+BEGINNING = 0.2
+"""Left out at the begin of a recording [s]: an arm in motion has been filtered for five time constants then."""
+SLOW = 1.5
+"""Time constant of what a change is compared with [s]."""
+SPEED, PUSH = 0.5, 1.0
+"""Of the components of variance that grow with speed [rad/s] and acceleration [rad/s²]; scales alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Parameters before any recording: normal, as those of a sound arm of which this is known."""
+
+    links: Array
+    """Inertial parameters (n, 10) in the bar frames."""
+    covariance: Array
+    """Of the links' parameters as `gravity_split` has them (10 n, 10 n)."""
+    joints: Array
+    """(n, C) of `JOINT_COLUMNS` and the waves."""
+    joints_std: Array
+    """(n, C)."""
+    noise: Array
+    """Standard deviation of a row (n,) [N·m]."""
+
+    @property
+    def n(self) -> int:
+        return len(self.links)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """S rows of all joints."""
+
+    left: Array
+    """Filtered torque less what is expected (S, n) [N·m]; a contact's has the opposite sign."""
+    by_link: Array
+    """(S, n, 10 n), as `gravity_split` has the parameters."""
+    by_joint: Array
+    """(S, n, C)."""
+    state: Array
+    """Components of variance (S, n, B) but for the model's own."""
+    motion: RigidMotion
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def part(self, rows: slice | Mask) -> "Rows":
+        return Rows(self.left[rows], self.by_link[rows], self.by_joint[rows], self.state[rows], self.motion.part(rows))
+
+
+def rows_of(filtered: FilteredRows, split: Array, joints: Array) -> Rows:
+    own = filtered.joints[filtered.chosen]
+    left = filtered.torque - filtered.links - (filtered.joints * joints).sum(-1)
+    return Rows(left[filtered.chosen], filtered.by_link @ split, own, _state(filtered), filtered.motion)
+
+
+def _state(filtered: FilteredRows) -> Array:
+    """Components of a joint's variance: constant, of its own state, and of how the whole arm moves."""
+    still, turning, speed, push = np.moveaxis(filtered.state[filtered.chosen], -1, 0)
+    speed, push = (speed / SPEED) ** 2, (push / PUSH) ** 2
+    whole = [np.broadcast_to(each.mean(axis=1, keepdims=True), each.shape) for each in (speed, push)]
+    return np.stack([np.ones_like(speed), still, turning, speed, push, *whole], axis=-1)
+
+
+COMPONENTS = 8
+"""Those of `_state`, and the model's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far rows of an arm without contact lie from what is expected."""
+
+    weights: Array
+    """Of the components of variance (n, B)."""
+    still: Array
+    """Factor on the standard deviation at rest (n,), that makes 95 % of the rows lie within their bounds."""
+    moving: Array
+    """The same in motion (n,)."""
+    correlation: Array
+    """Of the joints (n, n)."""
+
+    def std(self, state: Array, model: Array) -> Array:
+        """(S, n) [N·m], from the components and the model's own variance (S, n)."""
+        variance = (state * self.weights[:, :-1]).sum(-1) + self.weights[:, -1] * model
+        share = state[..., 1]
+        return np.asarray(np.sqrt(variance) * (share * self.still + (1.0 - share) * self.moving))
+
+    def deviation(self, left: Array, std: Array) -> Array:
+        """Square of the distance from nothing (S,), in standard deviations over all joints."""
+        scaled = left / std
+        return np.asarray(np.einsum("si,ij,sj->s", scaled, np.linalg.inv(self.correlation), scaled))
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalModel:
+    """What a torque is expected to be, and how sure that is."""
+
+    arm: Arm
+    links: Array
+    """Inertial parameters (n, 10) in the bar frames."""
+    joints: Array
+    """Each joint's own parameters (n, C)."""
+    factor: Array
+    """Factor of the covariance of all these (P, R), the links' as `gravity_split` has them."""
+    lasting: Spread
+    """Of rows."""
+    sudden: Spread
+    """Of rows less what they were before, over `SLOW`."""
+    maxima: tuple[Array, Array]
+    """Largest deviations of each stretch of the arm's own work, of rows and of their changes; empty without any."""
+    scale: Array
+    """(n,) [N·m], in which joints compare."""
+    seconds: float = 0.0
+    """Of the arm's own work that it rests on."""
+    split: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "split", gravity_split(self.arm))
+
+    def filter(self, rate: float) -> RowFilter:
+        """For samples of this rate [Hz]."""
+        return RowFilter(self.arm, self.links, rate, stride_of(rate))
+
+    def external(self, filtered: FilteredRows) -> Array:
+        """External torque at every sample (K, n) [N·m]: what the surroundings push the joints with."""
+        return np.asarray(filtered.links + (filtered.joints * self.joints).sum(-1) - filtered.torque)
+
+    def rows(self, filtered: FilteredRows) -> Rows:
+        return rows_of(filtered, self.split, self.joints)
+
+    def model_variance(self, rows: Rows) -> Array:
+        """Of the expected torque (S, n) [N²·m²]."""
+        return model_variance(rows, self.factor)
+
+
+def stride_of(rate: float) -> int:
+    return max(1, round(rate / ROWS_RATE))
+
+
+def expected(rows: Rows, change: Array) -> Array:
+    n = rows.left.shape[1]
+    shared = INERTIAL * n
+    own = change[shared:].reshape(n, -1)
+    return np.asarray(rows.by_link @ change[:shared] + (rows.by_joint * own).sum(-1))
+
+
+def model_variance(rows: Rows, factor: Array) -> Array:
+    n, out = rows.left.shape[1], np.empty(rows.left.shape)
+    shared, own = INERTIAL * n, rows.by_joint.shape[2]
+    for j in range(n):
+        place = slice(shared + j * own, shared + (j + 1) * own)
+        out[:, j] = ((rows.by_link[:, j] @ factor[:shared] + rows.by_joint[:, j] @ factor[place]) ** 2).sum(-1)
+    return out
+
+
+def from_records(arm: Arm, prior: Prior, scale: Array) -> ExternalModel:
+    """Without any work of the arm's own: the records' bounds alone, which nothing has proved."""
+    n = prior.n
+    covariance = _prior_covariance(prior)
+    weights = np.zeros((n, COMPONENTS))
+    weights[:, 0], weights[:, -1] = prior.noise**2, 1.0
+    friction = prior.joints[:, JOINT_COLUMNS.index("coulomb")]
+    weights[:, 1] = weights[:, 2] = friction**2  # at rest it may push either way
+    spread = Spread(weights, np.ones(n), np.ones(n), np.eye(n))
+    nothing = np.empty(0)
+    return ExternalModel(arm, prior.links, prior.joints, _factor(covariance), spread, spread, (nothing, nothing), scale)
+
+
+def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: Array) -> ExternalModel:
+    """From recordings without contact, of one rate [Hz]."""
+    split, parts = gravity_split(arm), []
+    for run in runs:
+        made = RowFilter(arm, prior.links, rate, stride_of(rate))
+        chunks = (run.part(slice(begin, begin + CHUNK)) for begin in range(0, len(run), CHUNK))
+        own = [rows_of(made.rows(chunk), split, prior.joints) for chunk in chunks]
+        parts.append(joined(own).part(slice(round(BEGINNING * ROWS_RATE), None)))
+    folds = _folds(parts)
+    pieces = [part for part in parts if len(part)]
+    fit = _Fit(prior, pieces, folds)
+    mean, factor, left, own_variance, change, change_variance = fit.result()
+    state = np.concatenate([piece.state for piece in pieces])
+    lasting, std = _spread(state, own_variance, left)
+    runs_of = np.concatenate([np.full(len(piece), k) for k, piece in enumerate(pieces)])
+    sudden, sudden_std = _spread(state, change_variance, change)
+    maxima = tuple(
+        np.concatenate([block_maxima(spread.deviation(x, s)[runs_of == k]) for k in range(len(pieces))])
+        for spread, x, s in ((lasting, left, std), (sudden, change, sudden_std))
+    )
+    seconds, shared = len(left) / ROWS_RATE, INERTIAL * arm.n
+    links = prior.links + (split @ mean[:shared]).reshape(arm.n, INERTIAL)
+    joints = prior.joints + mean[shared:].reshape(arm.n, -1)
+    return ExternalModel(arm, links, joints, factor, lasting, sudden, (maxima[0], maxima[1]), scale, seconds)
+
+
+def joined(parts: Sequence[Rows]) -> Rows:
+    moves = [part.motion for part in parts]
+    motion = RigidMotion(
+        moves[0].gravity,
+        np.concatenate([each.rotation for each in moves]),
+        np.concatenate([each.origin for each in moves]),
+        np.concatenate([each.screw for each in moves]),
+        np.concatenate([each.rate for each in moves]),
+        np.concatenate([each.screw_rate for each in moves]),
+    )
+    return Rows(
+        np.concatenate([part.left for part in parts]),
+        np.concatenate([part.by_link for part in parts]),
+        np.concatenate([part.by_joint for part in parts]),
+        np.concatenate([part.state for part in parts]),
+        motion,
+    )
+
+
+def change_of(rows: Rows) -> Rows:
+    """Rows less what they were before."""
+    left, by_link, by_joint = (each - slow_mean(each) for each in (rows.left, rows.by_link, rows.by_joint))
+    return Rows(left, by_link, by_joint, rows.state, rows.motion)
+
+
+def slow_mean(left: Array) -> Array:
+    """Mean of the rows before each one (S, …), exponentially over `SLOW`."""
+    out, share = np.empty_like(left), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
+    value = left[0].copy()
+    for row, each in enumerate(left):
+        out[row] = value
+        value += max(share, 1.0 / (row + 1)) * (each - value)
+    return out
+
+
+LEAST_VARIANCE = 0.04
+"""Of a row in any state, as a share of the mean over all states: states that the arm's own work hardly had are not as
+sure as they looked."""
+BLOCK = 2.0
+"""Stretch of which the largest deviation counts [s]: longer than deviations of one cause last."""
+
+
+def block_maxima(deviation: Array) -> Array:
+    size = round(BLOCK * ROWS_RATE)
+    whole = len(deviation) // size
+    return np.asarray(deviation[: whole * size].reshape(whole, size).max(axis=1))
+
+
+def _folds(parts: Sequence[Rows]) -> NDArray[np.intp]:
+    """Fold of each row: recordings, or stretches of them where there are few."""
+    filled = [len(part) for part in parts if len(part)]
+    if len(filled) >= FOLDS // 2:
+        return np.repeat(np.arange(len(filled)) % FOLDS, filled)
+    total = sum(filled)
+    return np.asarray(np.arange(total) * FOLDS // max(total, 1), dtype=np.intp)
+
+
+def _prior_covariance(prior: Prior) -> Array:
+    shared, own = prior.covariance, prior.joints_std.ravel() ** 2
+    covariance = np.zeros((len(shared) + own.size,) * 2)
+    covariance[: len(shared), : len(shared)] = shared
+    covariance[np.arange(len(shared), len(covariance)), np.arange(len(shared), len(covariance))] = own
+    return covariance
+
+
+def _factor(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-12 * max(values[-1], 1e-300)
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+class _Fit:
+    """Normal equations by fold; each fold's rows are judged by a fit to the others."""
+
+    def __init__(self, prior: Prior, pieces: Sequence[Rows], folds: NDArray[np.intp]) -> None:
+        self.prior, self.folds = prior, folds
+        self.rows = joined(pieces)
+        self.change = joined([change_of(piece) for piece in pieces])
+        n, self.shared = prior.n, INERTIAL * prior.n
+        covariance = _prior_covariance(prior)
+        self.scale = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
+        relative = covariance / np.outer(self.scale, self.scale) + 1e-9 * np.eye(len(covariance))
+        self.precision = np.linalg.inv(relative)
+        self.normal = np.zeros((FOLDS, n, len(self.scale), len(self.scale)), dtype=np.float32)
+        self.right = np.zeros((FOLDS, n, len(self.scale)))
+        for fold in range(FOLDS):
+            for j in range(n):
+                place, design = self._design(j, folds == fold)
+                self.normal[fold, j][np.ix_(place, place)] = design.T @ design
+                self.right[fold, j, place] = design.T @ self.rows.left[folds == fold, j]
+
+    def _design(self, j: int, rows: Mask) -> tuple[NDArray[np.intp], Array]:
+        own = self.rows.by_joint.shape[2]
+        place = np.append(np.arange(self.shared), self.shared + j * own + np.arange(own))
+        design = np.hstack([self.rows.by_link[rows, j], self.rows.by_joint[rows, j]])
+        return place, design * self.scale[place]
+
+    def result(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Mean (P,), factor of the covariance (P, R); what is left of rows not seen, the model's variance of it, and
+        both of the rows' changes, (S, n) each."""
+        noise, repeats = self.prior.noise.copy(), np.ones(self.prior.n)
+        for _ in range(ROUNDS):
+            weight = 1.0 / (noise**2 * repeats)
+            left, *others = self._judged(weight)
+            noise = np.sqrt(np.mean(left**2, axis=0)) + 1e-9
+            repeats = np.array([_repeats(left[:, j]) for j in range(self.prior.n)])
+        normal = self.precision + np.einsum("fjab,j->ab", self.normal, weight)
+        covariance = np.linalg.inv(normal)
+        mean = covariance @ np.einsum("fja,j->a", self.right, weight)
+        variance, change, change_variance = others
+        return mean * self.scale, _factor(covariance) * self.scale[:, None], left, variance, change, change_variance
+
+    def _judged(self, weight: Array) -> tuple[Array, Array, Array, Array]:
+        normal = np.einsum("fjab,j->fab", self.normal, weight)
+        right = np.einsum("fja,j->fa", self.right, weight)
+        out = np.empty((4, *self.rows.left.shape))
+        for fold in np.unique(self.folds):
+            own = self.folds == fold
+            covariance = np.linalg.inv(self.precision + normal.sum(0) - normal[fold])
+            mean = covariance @ (right.sum(0) - right[fold]) * self.scale
+            factor = np.asarray(np.linalg.cholesky((covariance + covariance.T) / 2) * self.scale[:, None], dtype=float)
+            for k, rows in enumerate((self.rows, self.change)):
+                part = rows.part(own)
+                out[2 * k, own] = part.left - expected(part, mean)
+                out[2 * k + 1, own] = model_variance(part, factor)
+        return out[0], out[1], out[2], out[3]
+
+
+def _repeats(left: Array) -> float:
+    """Rows that tell as much as one independent one: neighbours are alike."""
+    centred = left - left.mean()
+    power = float(centred @ centred) + 1e-300
+    total = 1.0
+    for lag in range(1, min(len(left) // 4, round(20 * ROWS_RATE))):
+        alike = float(centred[lag:] @ centred[:-lag]) / power
+        if alike < 0.05:
+            break
+        total += 2.0 * alike
+    return total
+
+
+def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
+    """Sizes of the components by maximum likelihood; then the factors of the bounds, by their 95 % quantile."""
+    n = left.shape[1]
+    weights, still, moving = np.empty((n, COMPONENTS)), np.ones(n), np.ones(n)
+    parts = np.concatenate([state, model[..., None]], axis=-1)
+    for j in range(n):
+        weights[j] = variance_components(parts[:, j], left[:, j] ** 2)
+        weights[j, -1] = max(weights[j, -1], 1.0)
+    spread = Spread(weights, still, moving, np.eye(n))
+    share = np.abs(left) / spread.std(state, model)
+    for j in range(n):
+        rest = state[:, j, 1] > 0.5
+        for chosen, out in ((rest, still), (~rest, moving)):
+            if chosen.sum() >= 100:
+                out[j] = np.quantile(share[chosen, j], 0.95) / NORMAL_95
+        if rest.sum() < 100:
+            still[j] = moving[j]
+        if (~rest).sum() < 100:
+            moving[j] = still[j]
+    spread = Spread(weights, still, moving, np.eye(n))
+    std = spread.std(state, model)
+    scaled = np.clip(left / std, -4.0, 4.0)
+    second = scaled.T @ scaled / len(scaled) + 0.2 * np.eye(n)
+    size = np.sqrt(np.diag(second))
+    return Spread(weights, still, moving, second / np.outer(size, size)), std
+
+
+def variance_components(parts: Array, square: Array) -> Array:
+    """Weights (B,) ≥ 0 of components (S, B) of a normal variable's variance, by maximum likelihood.
+
+    Each step raises the likelihood (majorisation: Hunter and Lange, The American Statistician 58, 2004).
+    """
+    mean = float(square.mean()) + 1e-24
+    typical = parts.mean(axis=0)
+    weights = mean / np.maximum(typical, 1e-12) / parts.shape[1]
+    weights[typical < 1e-12] = 0.0
+    least = LEAST_VARIANCE * mean
+    for _ in range(200):
+        variance = parts @ weights + least
+        up = parts.T @ (square / variance**2)
+        down = parts.T @ (1.0 / variance)
+        weights = weights * np.sqrt(up / np.maximum(down, 1e-300))
+    weights[0] += least
+    return np.asarray(weights)
