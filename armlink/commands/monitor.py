@@ -82,8 +82,7 @@ def monitor(
         ):
             while not refreshes or shown < refreshes:
                 answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
-                if isinstance(opened, ListeningBus):
-                    answer["remarks"] = opened.said()
+                answer["remarks"] = opened.said() if isinstance(opened, ListeningBus) else []
                 shown += 1
                 if console.is_terminal:
                     live.update(_table(title, answer), refresh=True)
@@ -145,6 +144,8 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     from rich.console import Group
     from rich.table import Table
 
+    from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
+
     table = Table(*COLUMNS, box=SIMPLE, title=title)
     for column in (1, 2, 3, 4, 7):
         table.columns[column].justify = "right"
@@ -161,9 +162,8 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
         )
     bus = answer["bus"]
     line = f"SYNC {bus['rate_hz']:.1f} Hz, load {bus['load']:.1%}, {bus['frames']} frames, {bus['errors']} errors"
-    remarks = answer.get("remarks")
-    if remarks is not None:
-        line = "; ".join((f"{bus['rate_hz']:.1f} readings a second", *remarks))
+    if all(joint["family"] == JOINT_STATE_FAMILY for joint in answer["joints"]):
+        line = "; ".join((f"{bus['rate_hz']:.1f} readings a second", *answer["remarks"]))
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
     if bus["dropped"]:
         line += f", {bus['dropped']} lost because this process read too slowly"

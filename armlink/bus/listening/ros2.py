@@ -43,9 +43,9 @@ class RosTopic:
         self._topic, self._domain = topic, _domain()
         quality = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(KEPT))
         try:
-            participant = DomainParticipant(self._domain)
-            named = Topic(participant, f"rt/{topic.lstrip('/')}", RosJointState, qos=quality)
-            self._reader = DataReader(participant, named, qos=quality)
+            self._participant = DomainParticipant(self._domain)  # it ends with its last reference
+            named = Topic(self._participant, f"rt/{topic.lstrip('/')}", RosJointState, qos=quality)
+            self._reader = DataReader(self._participant, named, qos=quality)
         except DDSException as error:
             raise BusFault(f"bus ros2:{topic}: cannot open it: {error}") from None
         self.lost = 0
@@ -67,7 +67,7 @@ class RosTopic:
         )
 
     def close(self) -> None:
-        del self._reader
+        del self._reader, self._participant
 
 
 def _message(sample: Any, arrived: float) -> JointStateMessage:
