@@ -5,6 +5,7 @@ from typing import Any
 from armlink.arm_file import Bus, LinkSection
 from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import MessageBus
+from armlink.bus.listening.joint_messages import ListeningBus, message_names
 from armlink.bus.port import interface_fault
 from armlink.errors import BadInput
 from armlink.extras import require_extra
@@ -14,6 +15,8 @@ EXTRAS = {"udp_multicast": "simulator"} | dict.fromkeys(
     ("damiao_serial", "gs_usb", "robotell", "robstride_serial", "seeedstudio", "serial", "slcan"), "adapters"
 )
 """Interface → the extra that brings what python-can needs for it."""
+LISTENING_INTERFACES = ("lerobot", "ros2")
+"""Messages of a program that commands the arm, in place of a bus: they can only be listened to."""
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0@1000000, or with CAN FD socketcan:can0@1000000/5000000"
 
 
@@ -45,18 +48,43 @@ def is_virtual(bus: Bus) -> bool:
     return bus.interface in VIRTUAL_INTERFACES or (bus.interface == "socketcan" and bus.channel.startswith("vcan"))
 
 
+def is_listening(bus: Bus) -> bool:
+    """Whether a bus carries messages of another program, and can only be listened to."""
+    return bus.interface in LISTENING_INTERFACES
+
+
+def open_listening_bus(bus: Bus, section: LinkSection) -> ListeningBus:
+    """Messages about the joints of an arm's link; raises BadInput, BusFault."""
+    name = f"{bus.interface}:{bus.channel}"
+    joints = message_names(section)
+    if bus.interface == "ros2":
+        require_extra(f"bus {name}", "ros2")
+        from armlink.bus.listening.ros2 import RosTopic
+
+        return ListeningBus(RosTopic(bus.channel), name, joints, rate=section.rate)
+    from armlink.bus.listening.lerobot import open_robot
+
+    source, torque_constants = open_robot(bus.channel)
+    return ListeningBus(source, name, joints, torque_constants, section.rate)
+
+
 def open_bus(spec: str | None, section: Bus) -> MessageBus:
     """Open the bus that `spec` names, by default that of the arm file's section.
 
     Raises BadInput for a malformed specification or an unknown interface, BusFault if the bus does not exist or cannot
     be opened.
     """
+    bus = resolve_bus(spec, section)
+    if is_listening(bus):
+        raise BadInput(
+            f"bus {bus.interface}:{bus.channel}: armlink only listens there: use record, monitor, observe, or "
+            "daemon --listen-only, with an arm file"
+        )
     import can
     from can.exceptions import CanInterfaceNotImplementedError
 
     from armlink.bus.adapters import adapt
 
-    bus = resolve_bus(spec, section)
     name = f"{bus.interface}:{bus.channel}"
     options: dict[str, Any] = {} if bus.interface == "socketcan" else {"bitrate": bus.bitrate}
     if bus.fd:
@@ -82,6 +110,8 @@ def open_link_bus(spec: str | None, section: LinkSection) -> MessageBus:
 
     Raises as open_bus.
     """
+    if is_listening(resolved := resolve_bus(spec, section.bus)):
+        return open_listening_bus(resolved, section)
     names = list(dict.fromkeys(joint.bus for joint in section.joints))
     if spec is not None or names == [""]:
         return open_bus(spec, section.bus)

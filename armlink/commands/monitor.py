@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import Arm, Json, OtherBus
+from armlink.commands.options import Arm, Json, LeRobot, OtherBus, Ros2
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -24,6 +24,8 @@ COLUMNS = ("joint", "node", "position [rad]", "torque [N·m]", "motor [N·m]", "
 def monitor(
     arm: Arm,
     bus: OtherBus = None,
+    ros2: Ros2 = None,
+    lerobot: LeRobot = None,
     once: Annotated[bool, typer.Option("--once", help="Show one table, then end.")] = False,
     cycles: Annotated[
         int, typer.Option(min=0, help="End after this many refreshes (5 a second); 0: run until Ctrl-C.")
@@ -57,14 +59,16 @@ def monitor(
     from rich.live import Live
 
     from armlink.arm_file import load_arm
+    from armlink.bus.listening.joint_messages import ListeningBus, silence_of
     from armlink.bus.open import open_link_bus
+    from armlink.commands.options import stated_bus
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BusFault
     from armlink.monitor.monitor import Monitor
 
     arm_file = load_arm(arm)
-    opened = open_link_bus(bus, arm_file.require_link())
+    opened = open_link_bus(stated_bus(bus, ros2, lerobot), arm_file.require_link())
     console = PlainConsole()
     answer: dict[str, Any] = {}
     title = f"{arm_file.name} on {opened.channel_info}"
@@ -78,6 +82,7 @@ def monitor(
         ):
             while not refreshes or shown < refreshes:
                 answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
+                answer["remarks"] = opened.said() if isinstance(opened, ListeningBus) else []
                 shown += 1
                 if console.is_terminal:
                     live.update(_table(title, answer), refresh=True)
@@ -89,7 +94,8 @@ def monitor(
             out.print(f"{sum(map(_is_heard, answer['joints']))} of {len(answer['joints'])} joints are heard")
             write_json(json, {"arm": arm_file.name, "serial": arm_file.serial, **answer})
     if not any(map(_is_heard, answer["joints"])):
-        raise BusFault(f"{title}: no joint is heard: does a host send SYNC? (--sync sends it)")
+        why = silence_of(opened, "does a host send SYNC? (--sync sends it)")
+        raise BusFault(f"{title}: no joint is heard: {why}")
     return 0
 
 
@@ -138,6 +144,8 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     from rich.console import Group
     from rich.table import Table
 
+    from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
+
     table = Table(*COLUMNS, box=SIMPLE, title=title)
     for column in (1, 2, 3, 4, 7):
         table.columns[column].justify = "right"
@@ -154,6 +162,8 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
         )
     bus = answer["bus"]
     line = f"SYNC {bus['rate_hz']:.1f} Hz, load {bus['load']:.1%}, {bus['frames']} frames, {bus['errors']} errors"
+    if all(joint["family"] == JOINT_STATE_FAMILY for joint in answer["joints"]):
+        line = "; ".join((f"{bus['rate_hz']:.1f} readings a second", *answer["remarks"]))
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
     if bus["dropped"]:
         line += f", {bus['dropped']} lost because this process read too slowly"

@@ -11,7 +11,35 @@ from typer.core import TyperCommand
 
 Arm = Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")]
 OtherBus = Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")]
+Ros2 = Annotated[
+    str | None,
+    typer.Option(
+        "--ros2",
+        metavar="TOPIC",
+        help="Listen to the joint states of this ROS 2 topic, such as /joint_states.",
+        rich_help_panel="Arms that another program commands",
+    ),
+]
+LeRobot = Annotated[
+    str | None,
+    typer.Option(
+        "--lerobot",
+        metavar="TYPE:PORT",
+        help="Listen to the LeRobot program that runs the robot on this port.",
+        rich_help_panel="Arms that another program commands",
+    ),
+]
 Json = Annotated[Path | None, typer.Option(help="Write the answer as JSON to this file; for standard output give `-`.")]
+
+
+def stated_bus(bus: str | None, ros2: str | None, lerobot: str | None) -> str | None:
+    """The bus INTERFACE:CHANNEL that one of these options names; None without any. Raises BadInput for two."""
+    from armlink.errors import BadInput
+
+    given = [each for each in (bus, ros2 and f"ros2:{ros2}", lerobot and f"lerobot:{lerobot}") if each]
+    if len(given) > 1:
+        raise BadInput("--bus, --ros2 and --lerobot: give one of them")
+    return given[0] if given else None
 
 
 def _of_reading(help_text: str, *names: str) -> Any:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from armlink.commands.options import Arm, Json, OtherBus
+from armlink.commands.options import Arm, Json, LeRobot, OtherBus, Ros2
 
 SUFFIX = ".mcap"
 
@@ -20,6 +20,8 @@ def record(
         Path | None, typer.Option(help="Write every frame unchanged to this file: .asc, .blf or .log.")
     ] = None,
     bus: OtherBus = None,
+    ros2: Ros2 = None,
+    lerobot: LeRobot = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to record [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     json: Json = None,
 ) -> int:
@@ -35,8 +37,10 @@ def record(
 
     from armlink.arm_file import load_arm
     from armlink.bus.frame_log import FrameLog
+    from armlink.bus.listening.joint_messages import silence_of
     from armlink.bus.open import open_link_bus
     from armlink.bus.taps import TappedBus
+    from armlink.commands.options import stated_bus
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
     from armlink.errors import BadInput, BusFault
@@ -57,7 +61,7 @@ def record(
     rows, last = 0, 0.0
     with contextlib.ExitStack() as stack:
         log = stack.enter_context(FrameLog(frames)) if frames else None
-        opened = open_link_bus(bus, arm_file.require_link())
+        opened = open_link_bus(stated_bus(bus, ros2, lerobot), arm_file.require_link())
         stack.callback(opened.shutdown)
         recorder = Recorder(arm_file, TappedBus(opened, log.write) if log else opened)
         try:
@@ -72,7 +76,8 @@ def record(
     if not rows:
         if out:
             out.unlink(missing_ok=True)
-        raise BusFault(f"{opened.channel_info}: no SYNC was heard: is a host running {arm_file.name}?")
+        why = silence_of(opened, f"no SYNC was heard: is a host running {arm_file.name}?")
+        raise BusFault(f"{opened.channel_info}: {why}")
     written = " and ".join(str(path) for path in (out, frames) if path)
     results(json).print(f"{written}: {rows} rows, {last:.1f} s")
     answer = {"file": out and str(out), "frames": frames and str(frames), "rows": rows, "seconds": last}

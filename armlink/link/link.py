@@ -15,6 +15,7 @@ from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
+from armlink.bus.listening.joint_messages import ListeningBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.orders import DriveIdentity, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Silence
@@ -66,6 +67,12 @@ class Link(Calibrations):
         `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`).
         """
         self.arm, self.bus = arm, as_bus(bus)
+        if isinstance(self.bus, ListeningBus):
+            self.bus.shutdown()
+            raise BadInput(
+                f"bus {self.bus.channel_info}: armlink only listens there, and this command commands the joints: use "
+                "record, monitor, observe, or daemon --listen-only"
+            )
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate

@@ -12,19 +12,22 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
+from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY, ListeningBus
 from armlink.bus.port import Port, StampedPort
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import DriveEvent
+from armlink.drives.family import family
 from armlink.drives.orders import Order
+from armlink.drives.traits import Traits
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.foreign_host import Commands, ForeignHost
-from armlink.link.joints.groups import make_groups
+from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import PlaceWatch
 from armlink.link.types import Sample, Stats
@@ -40,12 +43,38 @@ RESOLUTION = 1e-9
 """Times closer than this are the same [s]: a simulated clock may not move by less."""
 
 
+def heard_arm(arm: ArmFile, bus: CanBus) -> ArmFile:
+    """The arm as it is heard on `bus`: where that carries messages about joints in place of frames of drives, every
+    joint is one that messages tell of."""
+    if not isinstance(bus, ListeningBus):
+        return arm
+    section, constants = arm.require_link(), bus.torque_constants
+    told = zip(section.joints, traits_of(make_groups(arm)), strict=True)
+    joints = tuple(_told_joint(row, traits, constants.get(row.name)) for row, traits in told)
+    return arm.model_copy(update={"link": section.model_copy(update={"joints": joints})})
+
+
+def _told_joint(row: LinkJoint, traits: Traits, torque_constant: float | None) -> LinkJoint:
+    """A joint of a drive on CAN, of which another program tells by the joint's name: its positions are those of the
+    joint, and its efforts come from where the drive has them."""
+    if row.settings.family == JOINT_STATE_FAMILY:
+        return row
+    effort = "torque" if traits.torque == "link" else "motor"
+    keys: dict[str, object] = {"effort": effort, "calibration": traits.calibration}
+    if torque_constant is not None:
+        keys = {"effort": "current", "torque_constant": torque_constant}
+    drive = family(JOINT_STATE_FAMILY).settings.model_validate(
+        {"family": JOINT_STATE_FAMILY, "joint": row.name, **keys}
+    )
+    return row.model_copy(update={"node": None, "drive": drive, "bus": ""})
+
+
 class HeardArm:
     """An arm on a bus whose joints another host commands: what a listener knows of its drives, and of that host."""
 
     def __init__(self, arm: ArmFile, bus: CanBus) -> None:
         """Nothing is heard before `listen_on`; the bus's own clock counts if it has one, else the machine's."""
-        self.arm = arm
+        self.arm = arm = heard_arm(arm, bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate

@@ -23,6 +23,7 @@ import numpy as np
 
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
+from armlink.bus.listening.joint_messages import silence_of
 from armlink.bus.open import open_link_bus
 from armlink.errors import ArmlinkError, BusFault, Refused, Stall
 from armlink.link.bus_load import overload
@@ -405,9 +406,9 @@ class KeptLoop(DriveLoop):
                 self._up(Up(None, listener.uncalibrated))
         elif now - self._synced > SYNC_SECONDS and not self._silent:
             self._silent = True
-            self._channel.put(
-                Down(f"no SYNC on {listener.bus.channel_info}: is the program that commands the arm running?")
-            )
+            name = listener.bus.channel_info
+            why = silence_of(listener.bus, f"no SYNC on {name}: is the program that commands the arm running?")
+            self._channel.put(Down(why if name in why else f"{name}: {why}"))
 
     def _keep_pace(self, arm: Link | Listener) -> None:
         """Run an in-process simulated arm in real time: wait for the machine's clock."""

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from armlink.commands.options import LeRobot, Ros2
 from calib.commands.options import Store
 
 TAKE_OVER_SECONDS = 3.0
@@ -16,6 +17,8 @@ def daemon(
     bus: Annotated[
         str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; by default the bus of the arm file.")
     ] = None,
+    ros2: Ros2 = None,
+    lerobot: LeRobot = None,
     listen_only: Annotated[
         bool,
         typer.Option(
@@ -58,7 +61,8 @@ def daemon(
     Example: armlink daemon sarcos --bus socketcan:can0 --listen-only --policy propose
     """
     from armlink.arm_file import load_arm
-    from armlink.bus.open import resolve_bus
+    from armlink.bus.open import is_listening, resolve_bus
+    from armlink.commands.options import stated_bus
     from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.daemon.logs import log_to_stderr
@@ -67,7 +71,8 @@ def daemon(
 
     require_extra("daemon", "daemon")  # they are imported later
     described = load_arm(arm)
-    resolve_bus(bus, described.require_link().bus)
+    bus = stated_bus(bus, ros2, lerobot)
+    listen_only = listen_only or is_listening(resolve_bus(bus, described.require_link().bus))
     directory = state_directory(state, described)
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o750)

@@ -139,7 +139,7 @@ def test_commands_and_options_in_the_documentation_exist(capsys):
         if path not in helps:
             assert cli.run([*path, "--help"]) == 0, f"{page}: armlink {' '.join(path)}"
             helps[path] = capsys.readouterr().out
-        for option in re.findall(r"(?:^| )(--[a-z][a-z-]*)", " ".join(words[len(path) + 1 :])):
+        for option in re.findall(r"(?:^| )(--[a-z][a-z0-9-]*)", " ".join(words[len(path) + 1 :])):
             assert re.search(rf"{option}\b(?!-)", helps[path]), f"{page}: armlink {' '.join(path)} has no {option}"
 
 

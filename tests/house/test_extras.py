@@ -24,6 +24,7 @@ EXTRAS = {
     "postgresql": ("psycopg",),
     "reports": ("jinja2", "plotly"),
     "rerun": ("rerun",),
+    "ros2": ("cyclonedds",),
     "simulator": ("msgpack",),
 }
 """Extra → the modules that it alone brings."""

@@ -1,0 +1,124 @@
+"""Observes an arm that another program commands, or its recording: drifts, changes and payloads; sends nothing."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from armlink.commands.options import Arm, LeRobot, OtherBus, Ros2
+from calib.commands.options import JsonFile, Store
+
+if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
+    from armlink.arrays import Array
+
+CHANGES = ("drift", "effect", "payload")
+"""Kinds of event that name a change; others say that there may be one, or that it is gone."""
+WAIT_SECONDS = 0.2
+"""Longest wait for a sample, between two looks at the time [s]."""
+
+
+def observe(
+    arm: Arm,
+    recording: Annotated[
+        Path | None,
+        typer.Argument(help="A recording of the arm at work, in place of a live source.", show_default=False),
+    ] = None,
+    bus: OtherBus = None,
+    ros2: Ros2 = None,
+    lerobot: LeRobot = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
+    store: Store = None,
+    json_file: JsonFile = None,
+) -> int:
+    """Compare the torques of an arm at work with its calibration and gravity record; exit status 1 for a change.
+
+    It listens as the daemon does, and only tells: nothing is written or proposed. Exit status 3 if nothing is heard.
+
+    Example: armlink observe arm.yaml --ros2 /joint_states --seconds 600
+    """
+    from armlink.arm_file import load_arm
+    from armlink.commands.options import stated_bus
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole, results
+    from armlink.errors import BadInput
+    from calib.arm.kinematics import gcomp_arm
+    from calib.daemon.state.events import describe, one_alarm_a_joint
+    from calib.observer.observer import observer_of
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import RecordStore
+
+    arm_file, records = load_arm(arm), RecordStore(store)
+    source = stated_bus(bus, ros2, lerobot)
+    if recording is not None and source is not None:
+        raise BadInput(f"observe: {recording} and {source}: give a recording or a live source, not both")
+    calibration = records.required(CalibrationRecord, arm_file)
+    gravity = records.required(GravityRecord, arm_file).carrying(arm_file)
+    described = gcomp_arm(arm_file)
+    observer = observer_of(described, calibration, gravity, arm_file.require_link().rated_torques)
+    samples = _recorded(arm_file, recording) if recording is not None else _heard(arm_file, source, seconds)
+    console, told = PlainConsole(), list[dict[str, Any]]()
+    rows, first, last = 0, 0.0, 0.0
+    for t, position, torque in samples:
+        first, last, rows = (t if not rows else first), t, rows + 1
+        for event in one_alarm_a_joint(observer.handle(t, position, torque)):
+            kind, text, _ = describe(event)
+            console.print(f"{t - first:8.1f} s  {text}")
+            told.append({"t": t - first, "kind": kind, "joint": event.joint, "text": text})
+    found, out = observer.estimate(), results(json_file)
+    changes = [each for each in told if each["kind"] in CHANGES]
+    for each in changes:
+        out.print(f"{each['t']:.1f} s: {each['text']}")
+    out.print(f"{len(changes)} changes in {last - first:.1f} s of work ({rows} samples, {observer.rows} rows judged)")
+    answer = {
+        "schema": "armlink.observe/1",
+        "records": {"calibration": calibration.id, "gravity": gravity.id},
+        "seconds": last - first,
+        "samples": rows,
+        "rows": observer.rows,
+        "events": told,
+        "joints": list(described.names),
+        "gain": found.gain.tolist(),
+        "gain_std": found.gain_std.tolist(),
+        "offset": found.offset.tolist(),
+        "offset_std": found.offset_std.tolist(),
+    }
+    write_json(json_file, answer)
+    return int(bool(changes))
+
+
+def _recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]]":
+    from armlink.errors import BadInput
+    from armlink.recording.files import load_recording
+
+    run = load_recording(path)
+    names = arm.joint_names or tuple(joint.name for joint in arm.require_link().joints)
+    torque = run.torque if run.torque is not None else run.motor_torque
+    if run.n != len(names) or torque is None:
+        lacks = "no torques" if torque is None else f"{run.n} joints"
+        raise BadInput(f"{path}: it has {lacks}, expected torques of {len(names)} joints ({', '.join(names)})")
+    yield from ((float(t), q, tau) for t, q, tau in zip(run.t, run.position, torque, strict=True))
+
+
+def _heard(arm: "ArmFile", bus: str | None, seconds: float) -> "Iterator[tuple[float, Array, Array]]":
+    """Samples of a listener until the time is over or Ctrl-C; raises BusFault if none comes."""
+    import contextlib
+
+    from armlink.bus.listening.joint_messages import silence_of
+    from armlink.bus.open import open_link_bus
+    from armlink.errors import BusFault
+    from armlink.link.listener import Listener
+
+    opened = open_link_bus(bus, arm.require_link())
+    heard = False
+    with Listener(arm, opened) as listener, contextlib.suppress(KeyboardInterrupt):
+        end = listener.clock.now() + (seconds or float("inf"))
+        while (remaining := end - listener.clock.now()) > 0:
+            sample = listener.next(min(remaining, WAIT_SECONDS))
+            if sample is not None:
+                heard = True
+                yield sample.t, sample.position, sample.torque
+        if not heard:
+            why = silence_of(opened, f"no SYNC was heard: is a host running {arm.name}?")
+            raise BusFault(f"{opened.channel_info}: {why}")
