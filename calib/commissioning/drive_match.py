@@ -277,7 +277,7 @@ def drive_notes(drive: FoundDrive, rating: bool = True) -> list[str]:
     """Comments for the arm file; `rating`: its ratings are assumed as well."""
     notes = [drive.note, drive.wrong]
     if drive.largest_gains is not None:
-        notes.append("kp, kd assumed: the torque range per radian, and the damping that armlink doctor asks for")
+        notes.append("kp, kd assumed: the torque range per radian, with the damping that armlink doctor requires")
     if rating and not math.isfinite(drive.rated_torque):
         notes.append("rated_torque, max_torque assumed: the drive does not report them; take them from its data sheet")
     return [note for note in notes if note]

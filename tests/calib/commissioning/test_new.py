@@ -291,7 +291,7 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     made.write()
     assert cli.run(["new", "arm4.yaml", "--force", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
     assert [joint.settings for joint in load_arm("arm4.yaml").require_link().joints] == drives
-    assert "kp, kd assumed: the torque range per radian, and the damping that armlink doctor asks for" in comments(
+    assert "kp, kd assumed: the torque range per radian, with the damping that armlink doctor requires" in comments(
         "arm4.yaml"
     )
     (tmp_path / "old.yaml").write_text(yaml.safe_dump(content))
