@@ -129,7 +129,7 @@ def _check_scales(
                 "check --scales move: there is no terminal to ask for confirmation: give `--yes`, or use "
                 "`--scales hand`"
             )
-        confirm(f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?")
+        confirm(f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is their space clear?")
     with early_end(arm) as work:
         work.enabled = how == "move"
         found, channel = _judge_scales(console, arm, bus, how, seconds)

@@ -50,7 +50,7 @@ def _of_reading(help_text: str, *names: str) -> Any:
 UNITS = "q=deg, q=counts:4096 (a turn), q=percent:110 (degrees at 100), t=ms, tau_motor=A:12.5 (N·m/A)"
 Many, Text = list[str] | None, str
 OF_READING: dict[str, tuple[Any, Any]] = {
-    "columns": (Many, _of_reading("Columns of the file, by our names: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),
+    "columns": (Many, _of_reading("Columns to rename, OURS=THEIRS: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),
     "header": (
         Text, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - leaves one out.", "--columns")
     ),

@@ -76,7 +76,7 @@ class BusDrives:
             if family(name).traits.frame == "fd" and not searched.fd:
                 lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
             if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
-                lack = f"its frames could be taken for those of {beside.pop()}, or command its drives"
+                lack = f"its requests could command the {beside.pop()} drives, or be taken for their frames"
             if lack:
                 others.append(f"{name} ({lack})")
                 continue

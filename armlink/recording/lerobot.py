@@ -54,9 +54,7 @@ def load_lerobot(path: Path, efforts: bool = False) -> dict[str, Recording]:
             [_values(table[column], file, column, len(names) if column in columns[2:] else 0) for column in columns]
         )
     if not sum(len(part[0]) for part in parts):
-        raise BadInput(
-            f"{path}: the Parquet files under data/ have no rows: download the data set together with its data"
-        )
+        raise BadInput(f"{path}: the Parquet files under data/ have no rows: download the data set with these files")
     episodes, times, positions, commands, *torques = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = {}
     for episode in np.unique(episodes):

@@ -27,11 +27,11 @@ def external(
         str | None,
         typer.Option(
             metavar="JOINT[,X,Y,Z]",
-            help="Where the wrench is told: a point [m] in the frame that turns with this joint. By default the centre "
+            help="Reference point of the wrench [m], in the frame that turns with this joint. By default the centre "
             "of the tool, or of the last link.",
         ),
     ] = None,
-    false_alarms: Annotated[str, typer.Option(help="Rate of contacts that there were none: 1/h, 2/d.")] = "1/h",
+    false_alarms: Annotated[str, typer.Option(help="Allowed rate of false alarms: 1/h, 2/d.")] = "1/h",
     out: Annotated[
         Path | None, typer.Option(help="Write torques, bounds and wrench over time: .csv, or .mcap for ROS 2.")
     ] = None,
@@ -68,7 +68,8 @@ def external(
     every: list[Heard] = []
     if not free:
         PlainConsole().print(
-            "bounds by the records alone, proved by no work of the arm: give recordings without contact as --baseline",
+            "the bounds follow from the records alone, and were not checked on work of the arm: give recordings "
+            "without contact as --baseline",
             style="yellow",
         )
     names = records.stated.arm.names

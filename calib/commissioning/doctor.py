@@ -237,7 +237,7 @@ def _serial(arm_file: ArmFile, bus: str | None) -> Iterator[SetupFinding]:
         yield SetupFinding(
             "hint" if is_in_process(arm_file, bus) else "warning",
             f"serial is {arm_file.serial}: another arm of this name would share the calibrations of this "
-            "arm, so none is written to drives outside this process",
+            "arm, so they are written only to an arm that is simulated in this process",
             str(arm_file.path),
             "give the real arm a serial number before its first sweep (`serial: …`)",
         )

@@ -35,7 +35,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             what = (
                 f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g} N·m"
             )
-            yield SetupFinding("warning", what, joint.name, "compare both with the rating and the limit of the drive")
+            yield SetupFinding("warning", what, joint.name, "compare them with the rating and the limit of the drive")
         if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
             what = (
                 f"with max_torque_rate {joint.max_torque_rate:g} N·m/s the full torque comes within "

@@ -119,7 +119,9 @@ def _scale(records: ArmRecords, runs: Sequence[Samples]) -> Array:
     if arm_file is not None and arm_file.link is not None:
         return np.asarray(arm_file.link.rated_torques)
     if not runs:
-        raise BadInput("no recording is long enough to tell the size of the torques, and no arm file rates the joints")
+        raise BadInput(
+            "no recording is long enough to show the size of the torques, and no arm file gives rated torques"
+        )
     largest = np.percentile(np.abs(np.concatenate([run.torque for run in runs])), LARGEST_SHARE, axis=0)
     return np.asarray(np.maximum(largest, 0.02 * largest.max()))
 

@@ -182,7 +182,7 @@ def fit_creep(arm_file: ArmFile, data: Sequence[SweepData]) -> CreepFit:
     """Fit passes of creep sweeps, with and without a reference mass; raises BadInput where there is no such data."""
     rows = sweep_readings([each.require(arm_file) for each in data])
     if not rows.readings.velocity.any():
-        raise BadInput(f"{data[0].path}: no creep sweeps: sweep with sweep.motion: creep")
+        raise BadInput(f"{data[0].path}: no creep sweeps: set `sweep.motion: creep` and sweep again")
     doubt = sweep_section(arm_file).motor_doubt
     fit = fit_rows(gcomp_arm(arm_file), rows, arm_file.require_link().rated_torques, doubt)
     contacts = tuple(contact_finding(each, stall) for each in data for stall in each.contacts)

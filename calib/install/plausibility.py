@@ -128,7 +128,7 @@ def admit_rollback(
             continue
         for difference, limit in _too_far(new, now, scale):
             raise GateRefused(Refusal.FAR, joint.name, difference=difference, limit=limit)
-    return Admitted(record, arm, "roll-back: only the distance from the installed calibration")
+    return Admitted(record, arm, "roll-back: only the distance from the installed calibration was checked")
 
 
 def _too_far(new: TorqueCalibration[float], old: TorqueCalibration[float], rated: float) -> Iterator[tuple[str, str]]:

@@ -39,7 +39,7 @@ def sim(
     realism: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Small imperfections of a real arm, drawn from --seed: 1 for a good arm, 3 for a bad arm."
+            min=0, help="Size of the small imperfections of a real arm, drawn from --seed: 1 a good arm, 3 a bad arm."
         ),
     ] = None,
     lockstep: Annotated[

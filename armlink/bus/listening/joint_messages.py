@@ -97,7 +97,10 @@ class SenderClock:
         if self._stamp - LATE_SECONDS <= stamp <= self._stamp:
             return None
         if stamp < self._stamp:
-            log.warning("the time stamps of joint states went back by %.1f s: time goes on", self._stamp - stamp)
+            log.warning(
+                "the time stamps of joint states went back by %.1f s: the times of samples still increase",
+                self._stamp - stamp,
+            )
             self._shift = math.inf
         slack = CLOCK_DRIFT * max(arrived - self._arrived, 0.0) if math.isfinite(self._arrived) else 0.0
         self._shift = min(self._shift + slack, arrived - stamp)
@@ -222,7 +225,7 @@ class ListeningBus(InProcessBus):
         owned = [(number, name) for number, name in named if self._owns(message, name)]
         if len(owned) < len(named):
             twice = ", ".join(name for number, name in named if (number, name) not in owned)
-            self._remark(f"two publishers tell of {twice}: the first one counts")
+            self._remark(f"two publishers send {twice}: the first one counts")
         if not owned:
             return
         time = self._clocks.setdefault(message.source, SenderClock()).time(message.stamp, message.arrived)

@@ -113,5 +113,5 @@ FAMILY = Family(
     traits=TRAITS,
     settings=JointStateSettings,
     build=JointStateDrives,
-    summary="joints that ROS 2 or LeRobot tells of; only listened to",
+    summary="joints whose readings come from ROS 2 or LeRobot; armlink only listens",
 )

@@ -356,7 +356,8 @@ def _watched(settings: MyActuatorSettings) -> str:
     store = frames.timeout_command(100).hex().upper()
     return (
         "`timeout_ms` is not given in the `drive:` section: the drive keeps on with its last command after its host "
-        f"died; store a time-out in it once (100 ms: frame {COMMAND_ID + settings.id:03X}#{store}), and state it there"
+        f"died; store a time-out in the drive once (100 ms: frame {COMMAND_ID + settings.id:03X}#{store}), and state "
+        "it as `timeout_ms`"
     )
 
 
@@ -379,7 +380,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
             rated_torque=rated,
             max_torque=rated,
             model=told[drive],
-            note=f"{note}the drive does not report its time-out: store one in it (B3h), and state timeout_ms",
+            note=f"{note}the drive does not report its time-out: store a time-out in it (B3h), and state timeout_ms",
             answers=count[drive],
         )
         found.append(each)

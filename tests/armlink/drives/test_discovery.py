@@ -185,7 +185,7 @@ def test_beside_a_family_that_its_requests_command_none_is_asked(tmp_path, monke
     wired(tmp_path, "six-odrive", change)
     found, told = scanned(capsys)
     assert [each["address"] for each in found] == [f"node {48 + place}" for place in range(6)]
-    assert "canopen (its frames could be taken for those of odrive, or command its drives)" in told
+    assert "canopen (its requests could command the odrive drives, or be taken for their frames)" in told
     assert not [can_id for can_id, _ in sent if can_id == 0x7FF or 0x601 <= can_id <= 0x67F]
 
 

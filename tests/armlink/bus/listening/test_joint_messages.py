@@ -171,7 +171,7 @@ def test_two_publishers_of_one_joint_are_not_mixed():
     pairs = [(message(k), message(k, (7.0, 7.0), source="two")) for k in range(4)]
     found, bus = samples_of([each for pair in pairs for each in pair])
     assert {each.position[0] for each in found} == {0.1}
-    assert "two publishers tell of a, b" in bus.said()[0]
+    assert "two publishers send a, b" in bus.said()[0]
 
 
 def test_another_publisher_takes_over_when_the_first_has_gone():
