@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -67,7 +68,7 @@ def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
         folder = Path(scratch) / "case"
         shutil.copytree(public, folder)
         command = [tool.python, "-c", PROGRAM, str(HERE.parent), str(tool.adapter)]
-        before, limit = time.monotonic(), round(cpu_seconds + GRACE_S)
+        limit = round(cpu_seconds + GRACE_S)
         with (folder.parent / "log").open("wb") as log:
             process = subprocess.Popen(
                 command,
@@ -78,23 +79,24 @@ def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
                 start_new_session=True,
                 preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5)),
             )
-            used = _wait(process, WALL_FACTOR * cpu_seconds)
+            used, ended_by = _wait(process, WALL_FACTOR * cpu_seconds)
         made: dict[str, Any] = {"state": "failed", "why": (folder.parent / "log").read_text(errors="replace")[-300:]}
         if (folder / "answer.json").is_file():
             made = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
-        elif used >= limit - 1 or time.monotonic() - before >= WALL_FACTOR * cpu_seconds:
+        elif ended_by in (signal.SIGXCPU, signal.SIGKILL):
             made = {"state": "out of time", "why": f"more than {cpu_seconds:.0f} s"}
         return {**made, "cpu_seconds": used}
 
 
-def _wait(process: "subprocess.Popen[bytes]", wall_seconds: float) -> float:
-    """Processor time of the process and its children [s]; it is ended after `wall_seconds`."""
+def _wait(process: "subprocess.Popen[bytes]", wall_seconds: float) -> tuple[float, int]:
+    """Processor time of the process and its children [s], and the signal that ended it, or 0; it is killed after
+    `wall_seconds`."""
     end = time.monotonic() + wall_seconds
     while True:
-        pid, _, usage = os.wait4(process.pid, os.WNOHANG)
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
         if pid:
-            process.returncode = 0
-            return float(usage.ru_utime + usage.ru_stime)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            return float(usage.ru_utime + usage.ru_stime), os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         if time.monotonic() > end:
             process.kill()
             end = float("inf")

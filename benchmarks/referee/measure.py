@@ -24,6 +24,9 @@ TORQUE_WINDOW_S, POSITION_WINDOW_S = 0.25, 1.0
 """Length of a window [s]: under a recorded torque any arm strays with time."""
 SETTLING_S = 1.0
 """Time at both ends that is not judged: filters settle, and a simulation from rest."""
+FLOOR = {"share": 0.005, "position": 2e-4}
+"""What readings leave of the best model: noise of a torque over the torque, and noise and counts of an encoder [rad].
+It is added to every error, so that an arm that is like its model does not make ratios of noise."""
 DIVERGED_RAD = np.pi
 """Error of a position that counts where a simulation diverges."""
 
@@ -71,8 +74,12 @@ def errors(xml: str, joints: tuple[str, ...], kind: str, recording: dict[str, An
     if kind == "positions":
         window = round(POSITION_WINDOW_S / STEP_S)
         every = {"residual": window, "rollout": len(seen.q)}
-        return {name: _driven_by_commands(model, ids, seen, length) for name, length in every.items()}
-    return {"residual": _residual(model, at, dof, seen), "rollout": _driven_by_torque(model, at, dof, seen)}
+        moved = {name: _driven_by_commands(model, ids, seen, length) for name, length in every.items()}
+        return {name: float(np.hypot(error, FLOOR["position"])) for name, error in moved.items()}
+    return {
+        "residual": float(np.hypot(_residual(model, at, dof, seen), FLOOR["share"])),
+        "rollout": float(np.hypot(_driven_by_torque(model, at, dof, seen), FLOOR["position"])),
+    }
 
 
 def _residual(model: Any, at: Any, dof: Any, seen: Even) -> float:

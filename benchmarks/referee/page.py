@@ -41,7 +41,8 @@ def _round(made: Mapping[str, Any]) -> str:
         "|---|" + "---|" * len(tools),
     ]
     for score in SCORES:
-        cells = [_cell(found["scores"][score.key][tool], score) for tool in tools]
+        absent = found["not_offered"][score.key]
+        cells = [_cell(found["scores"][score.key][tool], score, tool not in absent) for tool in tools]
         lines.append(f"| {score.title} | " + " | ".join(cells) + " |")
     lines.append("| answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |")
     lines += ["", "Decided:", "", *_decided(found)]
@@ -58,9 +59,9 @@ def _title(made: Mapping[str, Any]) -> str:
     return f"{'Seeds' if len(made['seeds']) > 1 else 'Seed'} {seeds}: {made['cases']} cases, {made['date']}"
 
 
-def _cell(found: Mapping[str, Any] | None, score: Score) -> str:
+def _cell(found: Mapping[str, Any] | None, score: Score, offered: bool) -> str:
     if found is None:
-        return "not offered"
+        return "no case" if offered else "not offered"
     unit = 100.0 if score.share else 1.0
     value, low, high = (f"{unit * found[name]:.{'0f' if score.share else '3g'}}" for name in ("value", "low", "high"))
     return f"{value}{' %' if score.share else ''} ({low} to {high}; {found['cases']})"
@@ -105,12 +106,13 @@ def svg(made: Mapping[str, Any]) -> str:
         out.append(
             f'<g transform="translate({x},{y})"><text x="4" y="14" font-weight="bold">{escape(score.title)}</text>'
         )
-        out += _panel(made["summary"]["scores"][score.key], tools, score)
+        out += _panel(made["summary"], score)
         out.append("</g>")
     return "\n".join([*out, "</svg>", ""])
 
 
-def _panel(found: Mapping[str, Any], tools: Sequence[str], score: Score) -> list[str]:
+def _panel(summary: Mapping[str, Any], score: Score) -> list[str]:
+    found, tools, absent = summary["scores"][score.key], summary["tools"], summary["not_offered"][score.key]
     most = max([each["high"] for each in found.values() if each] + [1.0])
 
     def place(value: float) -> float:
@@ -128,7 +130,8 @@ def _panel(found: Mapping[str, Any], tools: Sequence[str], score: Score) -> list
         y, each = HEAD_PX + ROW_PX * row, found[tool]
         out.append(f'<text x="4" y="{y + 4}">{escape(tool)}</text>')
         if each is None:
-            out.append(f'<text x="{LABEL_PX + 6}" y="{y + 4}" fill="#999">not offered</text>')
+            why = "not offered" if tool in absent else "no case"
+            out.append(f'<text x="{LABEL_PX + 6}" y="{y + 4}" fill="#999">{why}</text>')
             continue
         colour = "#c03" if tool == "armlink" else "#36c"
         low, value, high = (place(each[name]) for name in ("low", "value", "high"))

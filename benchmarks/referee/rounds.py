@@ -116,10 +116,11 @@ def score_row(row: Json, opened: Json, nominal: str) -> Json:
     label, held = opened["label"], opened["heldout"]
     nameable = any(e["effect"] not in label["withheld"] for e in label["effects"])
     kept = {name: row.get(name, "") for name in ("tool", "case", "state", "why", "cpu_seconds")}
-    made = {**kept, "stratum": label["stratum"], "kind": label["kind"], "nameable": nameable}
+    made = {**kept, "stratum": label["stratum"], "kind": label["kind"], "nameable": nameable, "offers": []}
     scores: dict[str, float | None] = dict.fromkeys(each.key for each in score.SCORES)
     if row["state"] == "answered":
         answer = answer_from_json(row["answer"])
+        made["offers"] = score.offers(answer)
         scores = score.judge(answer, label) | {"cpu_seconds": row["cpu_seconds"]}
         if answer.model is not None:
             before = errors(nominal, tuple(label["joints"]), label["kind"], held)

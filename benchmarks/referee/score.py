@@ -33,19 +33,39 @@ class Score:
     share: bool
     """A share of cases, the larger the better; otherwise a geometric mean, the smaller the better, unless turned."""
     less_is_better: bool
+    needs: frozenset[str]
+    """What a tool has to offer for it."""
+
+
+def offers(answer: Answer) -> list[str]:
+    """What an answer has: causes, parameters, intervals, no causes, model."""
+    parts = {
+        "causes": answer.causes is not None,
+        "no causes": answer.causes is None,
+        "parameters": answer.parameters is not None,
+        "intervals": any(p.low is not None for p in answer.parameters or ()),
+        "model": answer.model is not None,
+    }
+    return [name for name, there in parts.items() if there]
 
 
 SCORES = (
-    Score("first_right", "right cause first", True, False),
-    Score("read_right", "right cause first, as read from the parameters", True, False),
-    Score("false_sure", "a false cause when sure", True, True),
-    Score("abstains", "abstains where nothing can be named", True, False),
-    Score("error", "error of a parameter, over its true change", False, True),
-    Score("coverage", "95 % intervals that hold", True, False),
-    Score("width", "width of an interval, over the true change", False, True),
-    Score("residual", "held-out residual, over the nominal model's", False, True),
-    Score("rollout", "roll-out in MuJoCo, over the nominal model's", False, True),
-    Score("cpu_seconds", "seconds of a core", False, True),
+    Score("first_right", "right cause first", True, False, frozenset({"causes"})),
+    Score(
+        "read_right",
+        "right cause first, as read from the parameters",
+        True,
+        False,
+        frozenset({"intervals", "no causes"}),
+    ),
+    Score("false_sure", "a false cause when sure", True, True, frozenset({"causes"})),
+    Score("abstains", "abstains where nothing can be named", True, False, frozenset({"causes"})),
+    Score("error", "error of a parameter, over its true change", False, True, frozenset({"parameters"})),
+    Score("coverage", "95 % intervals that hold", True, False, frozenset({"intervals"})),
+    Score("width", "width of an interval, over the true change", False, True, frozenset({"intervals"})),
+    Score("residual", "held-out residual, over the nominal model's", False, True, frozenset({"model"})),
+    Score("rollout", "roll-out in MuJoCo, over the nominal model's", False, True, frozenset({"model"})),
+    Score("cpu_seconds", "seconds of a core", False, True, frozenset()),
 )
 
 
@@ -78,7 +98,7 @@ def judge(answer: Answer, label: Json) -> dict[str, float | None]:
     if answer.parameters is not None and whole:
         scores |= _parameter_scores(answer.parameters, words, label["truth"])
         stated = [p for p in answer.parameters if p.low is not None and p.high is not None and p.nominal is not None]
-        if nameable and stated:
+        if answer.causes is None and nameable and stated:
             scores["read_right"] = float(family(max(stated, key=_deviations).name, words) in right)
     return scores
 
@@ -146,7 +166,9 @@ def summary(rows: Sequence[dict[str, Any]], seed: int = 0) -> dict[str, Any]:
             pairs = [(values[better][case], values[worse][case]) for case in sorted(common)]
             if is_decided(pairs, score, seed):
                 decided.append({"score": score.key, "better": better, "worse": worse, "cases": len(pairs)})
-    return {"tools": tools, "scores": table, "decided": decided}
+    offered = {tool: {part for row in rows if row["tool"] == tool for part in row["offers"]} for tool in tools}
+    missing = {s.key: [t for t in tools if not s.needs <= offered[t]] for s in SCORES}
+    return {"tools": tools, "scores": table, "decided": decided, "not_offered": missing}
 
 
 def _by_case(rows: Sequence[dict[str, Any]], tool: str, key: str) -> dict[str, float]:

@@ -97,6 +97,7 @@ def test_parameters_are_compared_with_the_true_change():
     assert made["error"] == pytest.approx(0.08 / 0.4)
     assert made["width"] == pytest.approx(0.24 / 0.4)
     assert made["coverage"] == 0.5
+    assert score.offers(answer) == ["no causes", "parameters", "intervals"]
     assert made["read_right"] == 1.0, "0.32 / 0.12 half widths of friction, 0.2 / 0.1 of damping"
     viscous = score.judge(answer, label(effect("friction.viscous", "joint_1"), truth=truth))
     assert viscous["read_right"] == 0.0
@@ -127,6 +128,7 @@ def row(tool, case, state="answered", nameable=True, **scores):
         "state": state,
         "why": "",
         "nameable": nameable,
+        "offers": ["causes"] if tool == "armlink" else ["no causes", "model"],
         "scores": {**every, **scores},
     }
 
@@ -156,6 +158,7 @@ def test_the_table_says_who_is_better_and_what_is_not_offered():
     made |= {"rows": rows, "no_worse": {"residual": (0, 8)}}
     text = page.markdown([made])
     assert "| right cause first | not offered | 100 % (68 to 100; 8) |" in text
+    assert "| error of a parameter, over its true change | not offered | not offered |" in text
     assert "held-out residual, over the nominal model's: peer is better than armlink" in text
     assert "not offered" in page.svg(made)
     turned = [{**each, "better": each["worse"], "worse": each["better"]} for each in found["decided"]]
@@ -187,8 +190,8 @@ def test_adapters_are_short_and_on_the_page():
 
 
 def test_a_round_with_the_adapter_of_the_page(tmp_path, monkeypatch):
-    """Half of the time is MuJoCo's: one arm, three recordings of four seconds."""
-    monkeypatch.setattr(mujoco_plant, "SECONDS", 4.0)
+    """Half of the time is MuJoCo's: one arm, three recordings of six seconds."""
+    monkeypatch.setattr(mujoco_plant, "SECONDS", 6.0)
     code = next(text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "ridge" in text)
     (tmp_path / "ridge.py").write_text(code, encoding="utf-8")
     (tmp_path / "sealed").mkdir()
@@ -215,13 +218,17 @@ def test_a_round_with_the_adapter_of_the_page(tmp_path, monkeypatch):
     assert scores["residual"] < 1.0
 
 
-def test_a_tool_that_is_not_there_is_said_so(tmp_path):
+def test_a_tool_that_is_not_there_or_never_ends_is_said_so(tmp_path, monkeypatch):
     (tmp_path / "absent.py").write_text("import a_package_that_nobody_has\n", encoding="utf-8")
     (tmp_path / "sick.py").write_text("def solve(case):\n    raise KeyError('no')\n", encoding="utf-8")
+    (tmp_path / "endless.py").write_text("def solve(case):\n    while True:\n        pass\n", encoding="utf-8")
+    monkeypatch.setattr(contest, "GRACE_S", 0.0)
     (tmp_path / "case").mkdir()
     told = {"joints": ["joint_1"], "kind": "torque", "withheld": [], "cpu_seconds": 5.0}
     (tmp_path / "case/case.json").write_text(json.dumps(told), encoding="utf-8")
-    tools = contest.tools([tmp_path / "absent.py", tmp_path / "sick.py"], ["absent", "sick"])
-    states = {tool.name: contest.run(tool, tmp_path / "case", 5.0) for tool in tools}
+    files = [tmp_path / f"{name}.py" for name in ("absent", "endless", "sick")]
+    tools = contest.tools(files, [path.stem for path in files])
+    states = {tool.name: contest.run(tool, tmp_path / "case", 2.0) for tool in tools}
+    assert states["endless"]["state"] == "out of time"
     assert states["absent"]["state"] == "not installed"
     assert (states["sick"]["state"], states["sick"]["why"]) == ("failed", "KeyError: 'no'")
