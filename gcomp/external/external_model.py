@@ -24,8 +24,8 @@ FOLDS = 8
 ROUNDS = 3
 CHUNK = 2000
 """Samples at a time."""
-BEGINNING = 0.2
-"""Left out at the begin of a recording [s]: an arm in motion has been filtered for five time constants then."""
+BEGINNING = 0.6
+"""Left out at the begin of a recording [s]: friction of an arm in motion has found its direction then."""
 SLOW = 1.5
 """Time constant of what a change is compared with [s]."""
 DRIFT = 120.0
@@ -101,7 +101,8 @@ class Spread:
     weights: Array
     """Of the components of variance (n, B)."""
     still: Array
-    """Factor on the standard deviation at rest (n,), that makes 95 % of the rows lie within their bounds."""
+    """Factor on the standard deviation at rest (n,) but for the model's own part, that makes 95 % of the rows lie
+    within their bounds."""
     moving: Array
     """The same in motion (n,)."""
     correlation: Array
@@ -109,9 +110,10 @@ class Spread:
 
     def std(self, state: Array, model: Array) -> Array:
         """(S, n) [N·m], from the components and the model's own variance (S, n)."""
-        variance = (state * self.weights[:, :-1]).sum(-1) + self.weights[:, -1] * model
         share = state[..., 1]
-        return np.asarray(np.sqrt(variance) * (share * self.still + (1.0 - share) * self.moving))
+        factor = share * self.still + (1.0 - share) * self.moving
+        own = (state * self.weights[:, :-1]).sum(-1) * factor**2
+        return np.asarray(np.sqrt(own + self.weights[:, -1] * model))
 
     def deviation(self, left: Array, std: Array) -> Array:
         """Square of the distance from nothing (S,), in standard deviations over all joints."""
@@ -280,6 +282,10 @@ def slow_mean(left: Array) -> Array:
     return out
 
 
+FEWEST_ROWS = 100
+"""From which the factor of the bounds is taken."""
+FACTORS = (0.3, 5.0)
+"""Range of that factor."""
 LEAST_VARIANCE = 0.04
 """Of a row in any state, as a share of the mean over all states: states that the arm's own work hardly had are not as
 sure as they looked."""
@@ -388,16 +394,15 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
     for j in range(n):
         weights[j] = variance_components(parts[:, j], left[:, j] ** 2)
         weights[j, -1] = max(weights[j, -1], 1.0)
-    spread = Spread(weights, still, moving, np.eye(n))
-    share = np.abs(left) / spread.std(state, model)
+    own, known = (state * weights[:, :-1]).sum(-1), weights[:, -1] * model
     for j in range(n):
         rest = state[:, j, 1] > 0.5
         for chosen, out in ((rest, still), (~rest, moving)):
-            if chosen.sum() >= 100:
-                out[j] = np.quantile(share[chosen, j], 0.95) / NORMAL_95
-        if rest.sum() < 100:
+            if chosen.sum() >= FEWEST_ROWS:
+                out[j] = _factor_of_95(left[chosen, j] ** 2, own[chosen, j], known[chosen, j])
+        if rest.sum() < FEWEST_ROWS:
             still[j] = moving[j]
-        if (~rest).sum() < 100:
+        if (~rest).sum() < FEWEST_ROWS:
             moving[j] = still[j]
     spread = Spread(weights, still, moving, np.eye(n))
     std = spread.std(state, model)
@@ -405,6 +410,12 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
     second = scaled.T @ scaled / len(scaled) + 0.2 * np.eye(n)
     size = np.sqrt(np.diag(second))
     return Spread(weights, still, moving, second / np.outer(size, size)), std
+
+
+def _factor_of_95(square: Array, own: Array, known: Array) -> float:
+    """Factor f with which 95 % of squares lie within the bounds of variances f² own + known."""
+    needed = np.sqrt(np.maximum(square / NORMAL_95**2 - known, 0.0) / own)
+    return float(np.clip(np.quantile(needed, 0.95), *FACTORS))
 
 
 def variance_components(parts: Array, square: Array) -> Array:
