@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 @reads_recordings
 def external(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
-    recordings: Annotated[list[str], typer.Argument(help="Recordings to judge.")],
     stated: "Corrections",
+    recordings: Annotated[list[str] | None, typer.Argument(help="Recordings to judge.")] = None,
     baseline: Annotated[
         list[str] | None,
         typer.Option(help="Recording of the arm's own work without contact, to learn from; may be repeated."),
@@ -34,6 +34,9 @@ def external(
     false_alarms: Annotated[str, typer.Option(help="Allowed rate of false alarms: 1/h, 2/d.")] = "1/h",
     out: Annotated[
         Path | None, typer.Option(help="Write torques, bounds and wrench over time: .csv, or .mcap for ROS 2.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
     ] = None,
     base: Annotated[
         str | None, typer.Option(help="Body of the model file that carries the chain; by default the world.")
@@ -51,16 +54,22 @@ def external(
 
     Example: armlink external arm.yaml run.mcap --baseline free.mcap
     """
+    import numpy as np
+
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
+    from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
     from calib.external.arm_model import listener_of
+    from calib.external.force_map import draw_map, smallest_forces
     from calib.external.listening import listen
     from calib.external.tables import answer_of, save_heard
 
+    if not recordings and picture is None:
+        raise BadInput("give recordings to judge, or --picture FILE.svg for the smallest force that is felt")
     per_hour = parse_rate(false_alarms)
     records = _records(arm, base, tip, tool, store)
-    judged = {label: each for path in recordings for label, each in load_recordings(path, stated).items()}
+    judged = {label: each for path in recordings or [] for label, each in load_recordings(path, stated).items()}
     free = [each for path in baseline or [] for each in load_recordings(path, stated).values()]
     listener = listener_of(records, free, list(judged.values()))
     place = parse_frame(frame, records)
@@ -78,6 +87,10 @@ def external(
         every += heard
         answers.append(answer_of(label, heard, names))
         _tell(console, answers[-1], names)
+    if picture is not None:
+        places, force = smallest_forces(listener.model, place, per_hour)
+        draw_map(picture, places, force, f"{arm}: smallest force at {names[place.link]} found in 95 %, at rest")
+        console.print(f"{picture}: half of the workspace needs {np.median(force):.1f} N or less")
     if out is not None:
         save_heard(out, every, names)
     write_json(

@@ -14,7 +14,7 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.load import bar_inertials
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
-from gcomp.external.external_model import ExternalModel, Prior, from_records, learn
+from gcomp.external.external_model import ROWS_RATE, ExternalModel, Prior, from_records, learn
 from gcomp.external.filtered_rows import Samples
 from gcomp.external.rigid_motion import INERTIAL
 
@@ -47,6 +47,12 @@ class ArmRecords:
         links[:, 0] = mass
         links[:, [4, 7, 9]] = (mass * (np.linalg.norm(arm.span, axis=1) ** 2 + 0.01) / 3.0)[:, None]
         return links
+
+    @property
+    def usual_channel(self) -> str:
+        """The channel that recordings of its own drives have."""
+        joints = () if self.calibration is None else self.calibration.joints
+        return "motor_torque" if any(each.motor is not None for each in joints) else "torque"
 
     def true_angles(self, recording: Recording) -> Recording:
         """Positions are recorded as the sensors read them."""
@@ -89,8 +95,8 @@ def listener_of(
     for each in every:
         if each.n != arm.n:
             raise BadInput(f"a recording has {each.n} joints ({', '.join(each.names)}), but the arm has {arm.n}")
-    channel = channel or channel_of(every)
-    rate = rate_of(every)
+    channel = channel or (channel_of(every) if every else records.usual_channel)
+    rate = rate_of(every) if every else ROWS_RATE
     warm = _usual_temperature(baselines or recordings)
 
     def samples(some: Sequence[Recording]) -> list[Samples]:

@@ -21,6 +21,9 @@ MASS_DOUBT, PLACE_DOUBT = 0.2, 0.3
 length: makers' models were found wrong by as much (UR10e and Panda; docs/external-torque.md)."""
 
 
+_MOTOR = MotorDoubt()
+
+
 @dataclass(frozen=True)
 class JointDoubt:
     """Standard deviations of a joint's own parameters; torques as shares of the joint's scale, the others per SI."""
@@ -49,6 +52,7 @@ class JointDoubt:
             "warm_coulomb": 0.02 * self.coulomb * scale,
             "warm_viscous": 0.02 * self.viscous * scale,
             "warm_offset": 1e-3 * self.offset * scale,
+            "warm_gain": _MOTOR.warming + 0.0 * scale,
             "rotor": self.rotor * scale,
             "gain": self.gain + 0.0 * scale,
         }
@@ -56,7 +60,6 @@ class JointDoubt:
         return np.hstack([own, np.repeat(self.waves * scale[:, None], WAVES, axis=1)])
 
 
-_MOTOR = MotorDoubt()
 MOTOR = JointDoubt(
     _MOTOR.offset_share, _MOTOR.coulomb_share, _MOTOR.load, 5 * _MOTOR.viscous_share, 0.05, 0.15, 0.02, 0.03
 )

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.external.external_model import BEGINNING, BLOCK, ROWS_RATE, SLOW, ExternalModel, Rows
+from gcomp.estimate.posterior import linear_posterior
+from gcomp.external.external_model import BEGINNING, BLOCK, DRIFT, ROWS_RATE, SLOW, ExternalModel, Rows
 from gcomp.external.rigid_motion import INERTIAL, RigidMotion, jacobian
 
 FEWEST_MAXIMA = 5
@@ -19,17 +20,19 @@ FEWEST_MAXIMA = 5
 HEAVIEST = 0.3
 """Largest shape of the extreme value distribution: a choice, as few stretches do not tell it."""
 ONE_SIDED_95 = 1.644854
-DECIDED = 4
-"""Rows until an event's cause is decided: 0.16 s, four time constants of the observer."""
+DECIDED = 6
+"""Rows until an event's cause is decided: 0.24 s, six time constants of the observer."""
 BEGINNING_ROWS = round(BEGINNING * ROWS_RATE)
 """Rows that are not judged: the filter begins with them."""
+EVIDENCE = 3.0
+"""Logarithm of the odds from which evidence is strong: twenty to one (Kass and Raftery, JASA 90, 1995)."""
 ENDED = 0.5
 """Share of the threshold below which an event ends."""
 ENDED_ROWS = 8
 """For so many rows in a row."""
 LASTING_ROWS = 75
 """Rows after which what still pushes is a load, if that explains it, or belongs to what the arm carries: 3 s."""
-POINTS = (0.0, 0.5, 1.0)
+POINTS = (0.1, 0.4, 0.7, 1.0)
 """Places of a contact between a link's joint and the next one."""
 FORCES = np.geomspace(0.5, 200.0, 8)
 """Standard deviations of a contact's force before it is seen [N]."""
@@ -38,7 +41,7 @@ MASSES = np.geomspace(0.05, 20.0, 8)
 LOAD_REACH = 0.15
 """The same of the place of its centre from the tool's [m]."""
 WIDTH = 0.06
-"""Half the width of a link [m], which adds to the lever of a force."""
+"""Half the width of a link [m]: a force acts so far beside the line between its joints."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class ContactEvent:
     t: float
     """When it began [s]."""
     kind: str
-    """`contact`, `load`, `load put down`."""
+    """`contact`, `load`, `load put down`, or `contact or load` while no motion has told them apart."""
     joints: tuple[int, ...]
     """Those whose torque it changes beyond what is expected, the most certain first."""
     link: int
@@ -118,7 +121,8 @@ class ContactDetector:
         self.load = np.zeros(4)
         """Mass [kg] and first moment [kg·m] of what the arm has taken up since."""
         self._slow: Array | None = None
-        self._slow_columns: list[Array] | None = None
+        self._slow_columns: Array | None = None
+        self._drift = np.zeros(n)
         self._seen = 0
         self._open: _Open | None = None
 
@@ -127,14 +131,14 @@ class ContactDetector:
         model, events = self.model, list[ContactEvent]()
         own = model.model_variance(rows)
         std = model.lasting.std(rows.state, own)
+        change_std = self._change_std(rows)
         left = -rows.left
         loaded = -(rows.by_link @ self._load_columns)
-        external, deviation, change_std = np.empty_like(left), np.empty(len(left)), np.empty_like(left)
+        external, deviation = np.empty_like(left), np.empty(len(left))
         for row in range(len(left)):
-            external[row] = left[row] - loaded[row] @ self.load
+            external[row] = left[row] - loaded[row] @ self.load - self._drift
             scaled = external[row] / std[row]
             deviation[row] = scaled @ self._lasting_inverse @ scaled
-            change_std[row] = self._change_std(rows, row)
             events += self._row(
                 float(t[row]),
                 external[row],
@@ -147,18 +151,19 @@ class ContactDetector:
             )
         return Judged(external, std, change_std, deviation), events
 
-    def _change_std(self, rows: Rows, row: int) -> Array:
-        """Standard deviation of a row's change since before (n,) [N·m]; what it was before goes on with it."""
-        columns = [rows.by_link[row], rows.by_joint[row]]
-        if self._slow_columns is None:
-            self._slow_columns = columns
-        away = [now - before for now, before in zip(columns, self._slow_columns, strict=True)]
-        change = Rows(rows.left[row][None], away[0][None], away[1][None], rows.state[row][None], rows.motion)
-        if self._open is None:
-            share = self._share()
-            self._slow_columns = [b + share * a for a, b in zip(away, self._slow_columns, strict=True)]
-        std = self.model.sudden.std(change.state, self.model.model_variance(change))
-        return np.asarray(std[0])
+    def _change_std(self, rows: Rows) -> Array:
+        """Standard deviation of the rows' change since before (S, n) [N·m]."""
+        columns = np.concatenate([rows.by_link, rows.by_joint], axis=-1)
+        away, share = np.empty_like(columns), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
+        for row, each in enumerate(columns):
+            if self._slow_columns is None or self._seen + row < BEGINNING_ROWS:
+                self._slow_columns = each
+            away[row] = each - self._slow_columns
+            count = self._seen + row - BEGINNING_ROWS + 1
+            self._slow_columns = self._slow_columns + max(share, 1.0 / max(count, 1)) * away[row]
+        shared = rows.by_link.shape[2]
+        change = Rows(rows.left, away[..., :shared], away[..., shared:], rows.state, rows.motion)
+        return self.model.sudden.std(rows.state, self.model.model_variance(change))
 
     def _share(self) -> float:
         """Weight of a row in the mean of what was before."""
@@ -170,7 +175,6 @@ class ContactDetector:
     ) -> Iterator[ContactEvent]:  # fmt: skip
         self._seen += 1
         if self._seen <= BEGINNING_ROWS:
-            self._slow_columns = None
             return
         if self._slow is None:
             self._slow = external.copy() if deviation < self.lasting_limit else 0.0 * external
@@ -183,72 +187,84 @@ class ContactDetector:
                 self._open = _Open(t, self._slow.copy() if by_change else 0.0 * external, by_change)
             else:
                 self._slow = self._slow + self._share() * (external - self._slow)
+                self._drift = self._drift + external / (DRIFT * ROWS_RATE)
         opened = self._open
         if opened is not None:
             yield from self._follow(opened, t, external, change_std if opened.by_change else std, loaded, motion, row)
             quiet = deviation < ENDED * self.lasting_limit and sudden < ENDED * self.sudden_limit
             opened.quiet = opened.quiet + 1 if quiet else 0
-            lasted = len(opened.rows) >= 2 * LASTING_ROWS and deviation < self.lasting_limit
+            lasted = opened.count >= 2 * LASTING_ROWS and deviation < self.lasting_limit
             if self._open is opened and (lasted or opened.quiet >= ENDED_ROWS):
-                self._open, self._slow, self._slow_columns = None, external.copy(), None
+                if opened.event is not None and opened.event.kind == "contact or load" and not lasted:
+                    yield replace(opened.event, kind="contact", mass=0.0, told=t)  # no load is gone so soon
+                self._open, self._slow = None, external.copy()
 
     def _follow(
         self, opened: "_Open", t: float, external: Array, std: Array, loaded: Array, motion: RigidMotion, row: int
     ) -> Iterator[ContactEvent]:
         opened.rows.append((external - opened.before, std, loaded))
-        count = len(opened.rows)
+        opened.count += 1
+        count, opened.rows = opened.count, opened.rows[-4 * LASTING_ROWS :]
         if count == DECIDED:
             event = self._decide(opened, t, motion, row)
             opened.event = event
             yield event
-        if count == LASTING_ROWS and opened.event is not None:
+        if count % LASTING_ROWS == 0 and opened.event is not None:
             taken = self._load(opened)
             if taken is not None:
                 before, self.load = self.load, self.load + taken
-                self._open, self._slow, self._slow_columns = None, external - loaded @ taken, None
+                self._open, self._slow = None, external - loaded @ taken
                 kind = "load" if self.load[0] > before[0] else "load put down"
                 if opened.event.kind != kind:
                     yield replace(opened.event, kind=kind, mass=float(taken[0]), told=t, least_force=0.0)
 
     def _decide(self, opened: "_Open", t: float, motion: RigidMotion, row: int) -> ContactEvent:
-        recent = opened.rows[-2:]
+        recent = opened.rows[-3:]
         change, std = np.mean([each[0] for each in recent], axis=0), recent[-1][1]
         spread = self.model.sudden if opened.by_change else self.model.lasting
         covariance = spread.correlation * np.outer(std, std)
         here = motion.part(slice(row, row + 1))
-        by_link = np.array([contact_likelihood(self.model, here, link, change, covariance) for link in range(len(std))])
+        by_link = np.array(
+            [contact_likelihood(self.model, here, link, self.tool, change, covariance) for link in range(len(std))]
+        )
         weight = np.exp(by_link - by_link.max())
         link = int(np.argmax(by_link))
         likelihood, load = load_likelihood(recent[-1][2], self.tool, change, covariance)
         size = np.abs(change) / std
         order = np.argsort(-size)
         odds = float(by_link.max() + np.log(weight.mean()) - likelihood)
-        kind = "contact" if odds > 0.0 else "load" if load > 0 else "load put down"
+        kind = "load" if load > 0.0 else "load put down"
+        if odds > -EVIDENCE:
+            kind = "contact" if odds > EVIDENCE else "contact or load"
         lever = levers(self.model, here, self.tool)
         least = float(np.max((np.abs(change) - ONE_SIDED_95 * std) / lever))
-        is_load = kind != "contact"
+        mass, least = (0.0 if odds > EVIDENCE else load), (0.0 if odds < -EVIDENCE else max(least, 0.0))
         return ContactEvent(
             opened.t, kind, tuple(int(j) for j in order if size[j] > ONE_SIDED_95) or (int(order[0]),), link,
-            float(weight[link] / weight.sum()), odds, 0.0 if is_load else max(least, 0.0), load if is_load else 0.0, t,
+            float(weight[link] / weight.sum()), odds, least, mass, t,
         )  # fmt: skip
 
     def _load(self, opened: "_Open") -> Array | None:
         """Load (4,) that explains all rows of an event, if one does."""
         change, std, columns = (np.array(each) for each in zip(*opened.rows, strict=True))
         change, std, columns = change[DECIDED:], std[DECIDED:], columns[DECIDED:]
-        white = (columns / std[..., None]).reshape(-1, 4)
-        wanted = (change / std).ravel()
-        normal = white.T @ white / ROWS_RATE + np.diag(1.0 / (np.array([5.0, *[5.0 * LOAD_REACH] * 3]) ** 2))
-        found = np.linalg.solve(normal, white.T @ wanted / ROWS_RATE)
-        left = (wanted - white @ found).reshape(len(change), -1)
+        columns[..., 0] += columns[..., 1:] @ self.tool
+        white = (columns / std[..., None]).reshape(-1, 4) / np.sqrt(ROWS_RATE)
+        wanted = (change / std).ravel() / np.sqrt(ROWS_RATE)
+        best, found = np.inf, np.zeros(4)
+        for size in MASSES:
+            own = size * np.array([1.0, *[LOAD_REACH] * 3])
+            fitted = linear_posterior(white, wanted, np.zeros(4), own)
+            cost = fitted.chi2 + float(np.linalg.slogdet(fitted.information * np.outer(own, own))[1])
+            if cost < best:
+                best, found = cost, fitted.x
+        left = (change - columns @ found) / std
         inverse = self._sudden_inverse if opened.by_change else self._lasting_inverse
         limit = self.sudden_limit if opened.by_change else self.lasting_limit
         misfit = float(np.mean(np.einsum("si,ij,sj->s", left, inverse, left)))
-        reach = np.linalg.norm(found[1:]) / max(abs(found[0]), 1e-9)
-        possible = self.load[0] + found[0] > -0.3 * abs(found[0]) and reach < 3.0 * LOAD_REACH + np.linalg.norm(
-            self.tool
-        )
-        return found if misfit < ENDED * limit and possible else None
+        possible = self.load[0] + found[0] > -0.3 * abs(found[0])
+        taken = np.append(found[0], found[1:] + found[0] * self.tool)
+        return taken if misfit < ENDED * limit and possible else None
 
 
 @dataclass
@@ -260,6 +276,7 @@ class _Open:
     """External torque before it (n,)."""
     by_change: bool
     rows: list[tuple[Array, Array, Array]] = None  # type: ignore[assignment]
+    count: int = 0
     quiet: int = 0
     event: ContactEvent | None = None
 
@@ -267,33 +284,29 @@ class _Open:
         self.rows = []
 
 
-def contact_likelihood(model: ExternalModel, motion: RigidMotion, link: int, change: Array, covariance: Array) -> float:
-    """Logarithm of the likelihood of a change (n,) by a force of unknown size and direction on a link."""
-    n = model.arm.n
+def contact_likelihood(
+    model: ExternalModel, motion: RigidMotion, link: int, tool: Array, change: Array, covariance: Array
+) -> float:
+    """Logarithm of the likelihood of a change (n,) by a force of unknown size and direction somewhere on a link."""
     found = []
     for share in POINTS:
-        point = share * model.arm.span[link] if link < n - 1 else share * np.array([0.0, 0.0, 0.1])
-        pull = jacobian(motion, link, point)[0, :3].T
-        found += [_normal(change, covariance + size**2 * pull @ pull.T) for size in FORCES]
-    return float(max(found))
+        point = share * (model.arm.span[link] if link < model.arm.n - 1 else tool)
+        pull, turn = np.split(jacobian(motion, link, point)[0].T, 2, axis=1)
+        unit = pull @ pull.T + WIDTH**2 * turn @ turn.T
+        found += [_normal(change, covariance + size**2 * unit) for size in FORCES]
+    highest = max(found)
+    return highest + float(np.log(np.mean(np.exp(np.array(found) - highest))))
 
 
 def load_likelihood(columns: Array, tool: Array, change: Array, covariance: Array) -> tuple[float, float]:
     """(Logarithm of the likelihood of a change by a load, its mass [kg]); columns (n, 4) of mass and first moment."""
     at_tool = columns[:, 0] + columns[:, 1:] @ tool
     reach = columns[:, 1:] * LOAD_REACH
-    best = max(
-        (
-            (_normal(change, covariance + size**2 * (np.outer(at_tool, at_tool) + reach @ reach.T)), size)
-            for size in MASSES
-        ),
-        key=lambda each: each[0],
-    )
-    likelihood, size = best
-    inner = covariance + size**2 * reach @ reach.T
-    weighted = np.linalg.solve(inner, at_tool)
+    found = [_normal(change, covariance + size**2 * (np.outer(at_tool, at_tool) + reach @ reach.T)) for size in MASSES]
+    highest, size = max(found), MASSES[int(np.argmax(found))]
+    weighted = np.linalg.solve(covariance + size**2 * reach @ reach.T, at_tool)
     mass = float(weighted @ change / (weighted @ at_tool + size**-2))
-    return likelihood, mass
+    return highest + float(np.log(np.mean(np.exp(np.array(found) - highest)))), mass
 
 
 def levers(model: ExternalModel, motion: RigidMotion, tool: Array) -> Array:

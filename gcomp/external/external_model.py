@@ -24,10 +24,13 @@ FOLDS = 8
 ROUNDS = 3
 CHUNK = 2000
 """Samples at a time."""
-BEGINNING = 0.2
-"""Left out at the begin of a recording [s]: an arm in motion has been filtered for five time constants then."""
+BEGINNING = 0.6
+"""Left out at the begin of a recording [s]: friction of an arm in motion has found its direction then."""
 SLOW = 1.5
 """Time constant of what a change is compared with [s]."""
+DRIFT = 120.0
+"""Time constant with which what is left over for good is taken for a drift of the arm's own, as of sensors that warm
+up [s]: of a push that lasts ten seconds a twelfth."""
 SPEED, PUSH = 0.5, 1.0
 """Of the components of variance that grow with speed [rad/s] and acceleration [rad/s²]; scales alone."""
 
@@ -98,7 +101,8 @@ class Spread:
     weights: Array
     """Of the components of variance (n, B)."""
     still: Array
-    """Factor on the standard deviation at rest (n,), that makes 95 % of the rows lie within their bounds."""
+    """Factor on the standard deviation at rest (n,) but for the model's own part, that makes 95 % of the rows lie
+    within their bounds."""
     moving: Array
     """The same in motion (n,)."""
     correlation: Array
@@ -106,9 +110,10 @@ class Spread:
 
     def std(self, state: Array, model: Array) -> Array:
         """(S, n) [N·m], from the components and the model's own variance (S, n)."""
-        variance = (state * self.weights[:, :-1]).sum(-1) + self.weights[:, -1] * model
         share = state[..., 1]
-        return np.asarray(np.sqrt(variance) * (share * self.still + (1.0 - share) * self.moving))
+        factor = share * self.still + (1.0 - share) * self.moving
+        own = (state * self.weights[:, :-1]).sum(-1) * factor**2
+        return np.asarray(np.sqrt(own + self.weights[:, -1] * model))
 
     def deviation(self, left: Array, std: Array) -> Array:
         """Square of the distance from nothing (S,), in standard deviations over all joints."""
@@ -125,8 +130,9 @@ class ExternalModel:
     """Inertial parameters (n, 10) in the bar frames."""
     joints: Array
     """Each joint's own parameters (n, C)."""
-    factor: Array
-    """Factor of the covariance of all these (P, R), the links' as `gravity_split` has them."""
+    factors: Array
+    """For each joint, factor of the covariance of the links' parameters, as `gravity_split` has them, and of its own,
+    (n, Q, Q)."""
     lasting: Spread
     """Of rows."""
     sudden: Spread
@@ -155,7 +161,7 @@ class ExternalModel:
 
     def model_variance(self, rows: Rows) -> Array:
         """Of the expected torque (S, n) [N²·m²]."""
-        return model_variance(rows, self.factor)
+        return model_variance(rows, self.factors)
 
 
 def stride_of(rate: float) -> int:
@@ -169,13 +175,23 @@ def expected(rows: Rows, change: Array) -> Array:
     return np.asarray(rows.by_link @ change[:shared] + (rows.by_joint * own).sum(-1))
 
 
-def model_variance(rows: Rows, factor: Array) -> Array:
-    n, out = rows.left.shape[1], np.empty(rows.left.shape)
-    shared, own = INERTIAL * n, rows.by_joint.shape[2]
-    for j in range(n):
-        place = slice(shared + j * own, shared + (j + 1) * own)
-        out[:, j] = ((rows.by_link[:, j] @ factor[:shared] + rows.by_joint[:, j] @ factor[place]) ** 2).sum(-1)
+def model_variance(rows: Rows, factors: Array) -> Array:
+    out = np.empty(rows.left.shape)
+    for j, factor in enumerate(factors):
+        out[:, j] = ((np.hstack([rows.by_link[:, j], rows.by_joint[:, j]]) @ factor) ** 2).sum(-1)
     return out
+
+
+def _factors(covariance: Array, n: int) -> Array:
+    """Factors (n, Q, Q) of each joint's part of the covariance of all parameters."""
+    shared = INERTIAL * n
+    own = (len(covariance) - shared) // n
+    found = []
+    for j in range(n):
+        place = np.append(np.arange(shared), shared + j * own + np.arange(own))
+        values, vectors = np.linalg.eigh(covariance[np.ix_(place, place)])
+        found.append(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.array(found)
 
 
 def from_records(arm: Arm, prior: Prior, scale: Array) -> ExternalModel:
@@ -188,7 +204,9 @@ def from_records(arm: Arm, prior: Prior, scale: Array) -> ExternalModel:
     weights[:, 1] = weights[:, 2] = friction**2  # at rest it may push either way
     spread = Spread(weights, np.ones(n), np.ones(n), np.eye(n))
     nothing = np.empty(0)
-    return ExternalModel(arm, prior.links, prior.joints, _factor(covariance), spread, spread, (nothing, nothing), scale)
+    return ExternalModel(
+        arm, prior.links, prior.joints, _factors(covariance, n), spread, spread, (nothing, nothing), scale
+    )
 
 
 def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: Array) -> ExternalModel:
@@ -202,10 +220,12 @@ def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: A
     folds = _folds(parts)
     pieces = [part for part in parts if len(part)]
     fit = _Fit(prior, pieces, folds)
-    mean, factor, left, own_variance, change, change_variance = fit.result()
+    mean, covariance, left, own_variance, change, change_variance = fit.result()
     state = np.concatenate([piece.state for piece in pieces])
+    runs_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    for k in range(len(pieces)):
+        left[runs_of == k] -= drift(left[runs_of == k])
     lasting, std = _spread(state, own_variance, left)
-    runs_of = np.concatenate([np.full(len(piece), k) for k, piece in enumerate(pieces)])
     sudden, sudden_std = _spread(state, change_variance, change)
     maxima = tuple(
         np.concatenate([block_maxima(spread.deviation(x, s)[runs_of == k]) for k in range(len(pieces))])
@@ -214,7 +234,9 @@ def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: A
     seconds, shared = len(left) / ROWS_RATE, INERTIAL * arm.n
     links = prior.links + (split @ mean[:shared]).reshape(arm.n, INERTIAL)
     joints = prior.joints + mean[shared:].reshape(arm.n, -1)
-    return ExternalModel(arm, links, joints, factor, lasting, sudden, (maxima[0], maxima[1]), scale, seconds)
+    return ExternalModel(
+        arm, links, joints, _factors(covariance, arm.n), lasting, sudden, (maxima[0], maxima[1]), scale, seconds
+    )
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
@@ -242,6 +264,14 @@ def change_of(rows: Rows) -> Rows:
     return Rows(left, by_link, by_joint, rows.state, rows.motion)
 
 
+def drift(left: Array) -> Array:
+    """What zeros have drifted by before each row (S, n), as far as the rows before show it."""
+    from scipy.signal import lfilter
+
+    share = 1.0 / (DRIFT * ROWS_RATE)
+    return np.asarray(lfilter([0.0, share], [1.0, share - 1.0], left, axis=0))
+
+
 def slow_mean(left: Array) -> Array:
     """Mean of the rows before each one (S, …), exponentially over `SLOW`."""
     out, share = np.empty_like(left), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
@@ -252,6 +282,10 @@ def slow_mean(left: Array) -> Array:
     return out
 
 
+FEWEST_ROWS = 100
+"""From which the factor of the bounds is taken."""
+FACTORS = (0.3, 5.0)
+"""Range of that factor."""
 LEAST_VARIANCE = 0.04
 """Of a row in any state, as a share of the mean over all states: states that the arm's own work hardly had are not as
 sure as they looked."""
@@ -282,12 +316,6 @@ def _prior_covariance(prior: Prior) -> Array:
     return covariance
 
 
-def _factor(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > 1e-12 * max(values[-1], 1e-300)
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-
-
 class _Fit:
     """Normal equations by fold; each fold's rows are judged by a fit to the others."""
 
@@ -315,8 +343,8 @@ class _Fit:
         return place, design * self.scale[place]
 
     def result(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Mean (P,), factor of the covariance (P, R); what is left of rows not seen, the model's variance of it, and
-        both of the rows' changes, (S, n) each."""
+        """Mean (P,) and covariance (P, P) of the parameters; what is left of rows not seen, the model's variance of it,
+        and both of the rows' changes, (S, n) each."""
         noise, repeats = self.prior.noise.copy(), np.ones(self.prior.n)
         for _ in range(ROUNDS):
             weight = 1.0 / (noise**2 * repeats)
@@ -327,7 +355,7 @@ class _Fit:
         covariance = np.linalg.inv(normal)
         mean = covariance @ np.einsum("fja,j->a", self.right, weight)
         variance, change, change_variance = others
-        return mean * self.scale, _factor(covariance) * self.scale[:, None], left, variance, change, change_variance
+        return mean * self.scale, covariance * np.outer(self.scale, self.scale), left, variance, change, change_variance
 
     def _judged(self, weight: Array) -> tuple[Array, Array, Array, Array]:
         normal = np.einsum("fjab,j->fab", self.normal, weight)
@@ -337,11 +365,11 @@ class _Fit:
             own = self.folds == fold
             covariance = np.linalg.inv(self.precision + normal.sum(0) - normal[fold])
             mean = covariance @ (right.sum(0) - right[fold]) * self.scale
-            factor = np.asarray(np.linalg.cholesky((covariance + covariance.T) / 2) * self.scale[:, None], dtype=float)
+            factors = _factors(covariance * np.outer(self.scale, self.scale), self.prior.n)
             for k, rows in enumerate((self.rows, self.change)):
                 part = rows.part(own)
                 out[2 * k, own] = part.left - expected(part, mean)
-                out[2 * k + 1, own] = model_variance(part, factor)
+                out[2 * k + 1, own] = model_variance(part, factors)
         return out[0], out[1], out[2], out[3]
 
 
@@ -366,16 +394,15 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
     for j in range(n):
         weights[j] = variance_components(parts[:, j], left[:, j] ** 2)
         weights[j, -1] = max(weights[j, -1], 1.0)
-    spread = Spread(weights, still, moving, np.eye(n))
-    share = np.abs(left) / spread.std(state, model)
+    own, known = (state * weights[:, :-1]).sum(-1), weights[:, -1] * model
     for j in range(n):
         rest = state[:, j, 1] > 0.5
         for chosen, out in ((rest, still), (~rest, moving)):
-            if chosen.sum() >= 100:
-                out[j] = np.quantile(share[chosen, j], 0.95) / NORMAL_95
-        if rest.sum() < 100:
+            if chosen.sum() >= FEWEST_ROWS:
+                out[j] = _factor_of_95(left[chosen, j] ** 2, own[chosen, j], known[chosen, j])
+        if rest.sum() < FEWEST_ROWS:
             still[j] = moving[j]
-        if (~rest).sum() < 100:
+        if (~rest).sum() < FEWEST_ROWS:
             moving[j] = still[j]
     spread = Spread(weights, still, moving, np.eye(n))
     std = spread.std(state, model)
@@ -383,6 +410,12 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
     second = scaled.T @ scaled / len(scaled) + 0.2 * np.eye(n)
     size = np.sqrt(np.diag(second))
     return Spread(weights, still, moving, second / np.outer(size, size)), std
+
+
+def _factor_of_95(square: Array, own: Array, known: Array) -> float:
+    """Factor f with which 95 % of squares lie within the bounds of variances f² own + known."""
+    needed = np.sqrt(np.maximum(square / NORMAL_95**2 - known, 0.0) / own)
+    return float(np.clip(np.quantile(needed, 0.95), *FACTORS))
 
 
 def variance_components(parts: Array, square: Array) -> Array:

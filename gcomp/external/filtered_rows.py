@@ -35,7 +35,7 @@ WAVE_LENGTH = 1.0
 """Distance over which that is alike [rad], as in the observer's discrepancy."""
 JOINT_COLUMNS = (
     "offset", "coulomb", "coulomb_wide", "breakaway", "load", "viscous", "quadratic", "uneven_cos", "uneven_sin",
-    "warm_coulomb", "warm_viscous", "warm_offset", "rotor", "gain",
+    "warm_coulomb", "warm_viscous", "warm_offset", "warm_gain", "rotor", "gain",
 )  # fmt: skip
 """Columns of a joint's own parameters, before the waves."""
 
@@ -154,6 +154,7 @@ class RowFilter:
             "warm_coulomb": narrow * warm,
             "warm_viscous": v * warm,
             "warm_offset": warm,
+            "warm_gain": gravity * warm,
             "rotor": np.zeros_like(q),
             "gain": gravity,
         }

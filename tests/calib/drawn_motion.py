@@ -226,7 +226,9 @@ class DrawnMotion:
                 goal = self.random.uniform(-1.0, 1.0, len(v))
             still = np.abs(v) < 1e-9
             pushed = np.clip(value + v / RATE / self.way, -1.0, 1.0)
-            value = np.where(still, goal + keep * (value - goal), pushed) if not moving else np.where(still, value, pushed)
+            value = (
+                np.where(still, goal + keep * (value - goal), pushed) if not moving else np.where(still, value, pushed)
+            )
             out[k] = value
             before = moving
         return out

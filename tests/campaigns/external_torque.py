@@ -44,6 +44,7 @@ from calib.records.records import (
     matrix,
     provenance,
 )
+from gcomp.arm.mass_moments import base_parameters
 from gcomp.external.contact import ContactDetector, threshold
 from gcomp.external.external_model import BEGINNING, CHUNK, ROWS_RATE, block_maxima
 from gcomp.external.filtered_rows import BANDWIDTH, RowFilter
@@ -57,6 +58,8 @@ EVERY, LASTS = 6.0, 0.7
 FOUND_WITHIN = 0.3
 STRONGEST = 150.0
 """A push that would have to be stronger to be told is not made [N]."""
+LENGTH = 0.05
+"""A link that is shorter has no surface to push [m]."""
 TIMES_TOLD = 1.5
 MAKER = 0.1
 """Standard deviation of a maker's masses, as a share."""
@@ -168,10 +171,13 @@ def judge(arm: Arm, seconds: float) -> Outcome:
     needed = forces_needed(arm, listener, baseline, quiet, work, heard, pushes, frame)
     pushed = next(iter(listen(listener, arm.recording(work, pushes=[p for p, _ in pushes]), frame, 1.0)))
     found, right = 0, 0
+    long = np.linalg.norm(kinematics.span[:-1], axis=1) >= LENGTH
+    place = np.concatenate([[0], np.cumsum(long)])
+    """Number of the link among those that have a length: one without, as in a wrist, is its neighbours' end."""
     for push, _ in pushes:
         own = [e for e in pushed.events if push.begin - 0.02 <= e.t <= push.begin + FOUND_WITHIN]
         found += bool(own)
-        right += bool(own) and abs(own[0].link - push.link) <= 1
+        right += bool(own) and abs(place[own[0].link] - place[push.link]) <= 1
     loads = draw_loads(arm, work, random)
     carried = next(iter(listen(listener, arm.recording(work, loads=loads), frame, 1.0)))
     near = [
@@ -198,6 +204,8 @@ def draw_pushes(arm: Arm, listener: Listener, work: Motion, heard: Heard, random
             link = int(random.integers(n))
             share = random.uniform(0.3, 1.0)
             span = arm.records.stated.arm.span[link]
+            if link < n - 1 and np.linalg.norm(span) < LENGTH:
+                continue
             point = share * span if link < n - 1 else np.array([0.0, 0.0, 0.1 * share])
             way = random.normal(size=3)
             way /= np.linalg.norm(way)
@@ -238,7 +246,10 @@ def forces_needed(arm, listener, baseline, quiet, work, heard, pushes, frame) ->
     detector = ContactDetector(model, 1.0, frame.point)
     prior = prior_of(arm.records, listener.channel, scale)
     none = np.zeros_like(prior.joints)
-    plain = {"nominal": (arm.nominal, none), "calibrated": (prior.links, prior.joints)}
+    links = arm.nominal.copy()
+    own = base_parameters(kinematics, links[:, 0], links[:, 1:4])
+    links[:, 1:3] += (np.array(arm.records.gravity.beta) - own).reshape(-1, 2)
+    plain = {"nominal": (arm.nominal, none), "calibrated": (links, prior.joints)}
     left = {}
     for name, (links, joints) in plain.items():
         base, own = (plain_left(kinematics, links, joints, listener, each) for each in (baseline, quiet))
@@ -260,7 +271,9 @@ def forces_needed(arm, listener, baseline, quiet, work, heard, pushes, frame) ->
             continue
         pull = np.stack([np.interp(heard.t[rows], short.t, column) for column in response.T], axis=1)
         before = slow[rows[0]]
-        external, std, change_std = (x[rows] for x in (heard.judged.external, heard.judged.std, heard.judged.change_std))
+        external, std, change_std = (
+            x[rows] for x in (heard.judged.external, heard.judged.std, heard.judged.change_std)
+        )
         a = (external[None] + sizes[:, None, None] * pull) / std
         b = (external[None] - before + sizes[:, None, None] * pull) / change_std
         over = np.einsum("fsi,ij,fsj->fs", a, lasting, a) > detector.lasting_limit

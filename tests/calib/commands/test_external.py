@@ -1,0 +1,118 @@
+"""`armlink external` on recordings of an arm with a model file alone, and of one with records."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armlink.arm_file import load_arm
+from armlink.cli import run
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
+from calib.records.records import GravityRecord, matrix, provenance
+from calib.records.store import RecordStore
+from gcomp.arm.load import inertial_torque, load_model, place_chain
+from gcomp.gravity.torque import gravity_torque
+
+LINK = (
+    "<body pos='{0} 0 0'><joint name='{1}' axis='0 1 {2}'/>"
+    "<inertial pos='0.2 0.02 0.05' mass='{3}' diaginertia='0.02 0.03 0.02'/>"
+)
+MODEL = f"""<mujoco><worldbody>{LINK.format(0, "j1", 0.5, 2)}{LINK.format(0.4, "j2", 0, 1.5)}
+{LINK.format(0.3, "j3", -1, 1)}</body></body></body></worldbody></mujoco>"""
+SECONDS = 40.0
+
+
+def recording(model: Path, seed: int, push: float = 0.0) -> Recording:
+    """Of swinging joints with friction; a push on the second joint from 20 to 21 s."""
+    random, t = np.random.default_rng(seed), np.arange(0.0, SECONDS, 0.02)
+    placed = place_chain(model)
+    pace, phase = random.uniform(0.5, 1.5, (2, 3)), random.uniform(0, 6, (2, 3))
+    angle = t[:, None, None] * pace + phase
+    q, v, a = 0.6 * np.sin(angle), 0.6 * pace * np.cos(angle), -0.6 * pace**2 * np.sin(angle)
+    q, v, a = (each.sum(axis=1) for each in (q, v, a))
+    torque = inertial_torque(placed, q, v, a) + gravity_torque(placed.arm.arm, placed.arm.beta, q)
+    torque += 0.4 * np.tanh(v / 0.01) + 0.02 * random.normal(size=q.shape)
+    torque -= np.outer((t >= 20.0) & (t < 21.0), [0.0, push, 0.0])
+    return Recording(t=t, position=q, velocity=v, motor_torque=torque)
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("external")
+    (folder / "arm.xml").write_text(MODEL)
+    for name, seed, push in (
+        ("free_1", 1, 0.0),
+        ("free_2", 4, 0.0),
+        ("free_3", 5, 0.0),
+        ("free_4", 6, 0.0),
+        ("quiet", 2, 0.0),
+        ("pushed", 3, 8.0),
+    ):
+        save_recording(recording(folder / "arm.xml", seed, push), folder / f"{name}.csv")
+    return folder
+
+
+def test_a_push_is_found_and_free_motion_is_quiet(workplace, capsys):
+    words = ["external", "arm.xml", "quiet.csv", "pushed.csv", "--out", "out.csv"]
+    words += [word for k in range(1, 5) for word in ("--baseline", f"free_{k}.csv")]
+    with pytest.MonkeyPatch.context() as here:
+        here.chdir(workplace)
+        assert run([*words, "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["channel"] == "motor_torque"
+    assert answer["baseline_s"] == pytest.approx(4 * SECONDS, abs=4.0)
+    quiet, pushed = answer["recordings"]
+    assert quiet["events"] == []
+    assert [event["kind"] for event in pushed["events"]] == ["contact"]
+    assert pushed["events"][0]["t"] == pytest.approx(20.1, abs=0.2)
+    assert pushed["events"][0]["link"] != "j1"
+    with (workplace / "out.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    middle = [row for row in rows[len(rows) // 2 :] if 20.5 < float(row["t"]) < 20.9]
+    told = np.array([float(row["tau_ext_2"]) for row in middle])
+    assert told == pytest.approx(8.0, abs=1.5)
+
+
+def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    joints = [
+        {"name": name, "node": node, "rated_torque": 20.0, "max_torque": 15.0}
+        for node, name in enumerate(("j1", "j2", "j3"), start=1)
+    ]
+    Path("arm.yaml").write_text(
+        json.dumps({"name": "bench", "serial": "1", "kinematics": {"model": "arm.xml"}, "link": {"joints": joints}})
+    )
+    arm, model = load_arm("arm.yaml"), load_model(Path("arm.xml"))
+    covariance = matrix(1e-6 * np.eye(6))
+    gravity = GravityRecord(
+        **provenance(arm), names=model.arm.names, beta=tuple(model.beta.tolist()), covariance=covariance,
+        identifiable=(True,) * 6, gravity=tuple(model.arm.gravity.tolist()),
+    )  # fmt: skip
+    RecordStore("records.db").put(gravity, arm, "test", "test")
+    words = ["external", "arm.yaml", "quiet.csv", "--store", "records.db", "--picture", "felt.svg", "--json", "-"]
+    assert run(words) == 0
+    out = capsys.readouterr()
+    answer = json.loads(out.out)
+    assert answer["baseline_s"] == 0.0
+    assert "by the records alone" in out.err
+    assert Path("felt.svg").read_text().startswith("<svg")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("arm.xml", "--picture"),
+        ("arm.xml quiet.csv --false-alarms often", "--false-alarms often"),
+        ("arm.xml quiet.csv --frame j9", "one of the joints j1, j2, j3"),
+        ("arm.xml quiet.csv --frame j2,1", "JOINT,X,Y,Z"),
+        ("arm.xml quiet.csv --out out.txt", "out.txt"),
+        ("none.xml quiet.csv", "none.xml"),
+    ],
+)
+def test_bad_input_is_one_line(workplace, monkeypatch, capsys, words, said):
+    monkeypatch.chdir(workplace)
+    assert run(["external", *words.split()]) == 2
+    assert said in capsys.readouterr().err
