@@ -100,12 +100,13 @@ class Passes:
     """Passes of a program's loop: how late each began, and how long it took."""
 
     def __init__(self, rate: float, seconds: float) -> None:
-        self._period, self._count = 1 / rate, int(rate * seconds)
+        self._period, self._seconds = 1 / rate, seconds
         self.late, self.took = list[float](), list[float]()
 
     def __iter__(self) -> Any:
         due = time.perf_counter()
-        for _ in range(self._count):
+        end = due + self._seconds
+        while due < end:
             due += self._period
             time.sleep(max(due - time.perf_counter(), 0.0))
             began = time.perf_counter()
