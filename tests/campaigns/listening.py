@@ -53,6 +53,8 @@ LOOP_HZ = 30.0
 SERVOS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 SERVO, TORQUE_CONSTANT = MODELS["sts3215"], 2.0
 """Torque of this arm's joints by current [N·m/A]."""
+PATIENCE_MS = 5_000
+"""Servos that are a program on a busy machine may answer later than the SDK's 40 ms."""
 CYCLONEDDS = (
     "<Domain><General><Interfaces><NetworkInterface name='lo' multicast='true'/></Interfaces></General></Domain>"
 )
@@ -98,12 +100,13 @@ class Passes:
     """Passes of a program's loop: how late each began, and how long it took."""
 
     def __init__(self, rate: float, seconds: float) -> None:
-        self._period, self._count = 1 / rate, int(rate * seconds)
+        self._period, self._seconds = 1 / rate, seconds
         self.late, self.took = list[float](), list[float]()
 
     def __iter__(self) -> Any:
         due = time.perf_counter()
-        for _ in range(self._count):
+        end = due + self._seconds
+        while due < end:
             due += self._period
             time.sleep(max(due - time.perf_counter(), 0.0))
             began = time.perf_counter()
@@ -150,6 +153,7 @@ def teleoperate(port: str, seconds: float) -> None:
 
     line, packet = sdk.PortHandler(port), sdk.PacketHandler(0)
     line.setBaudRate(1_000_000)
+    line.setPacketTimeout = lambda size: line.setPacketTimeoutMillis(PATIENCE_MS)
     ids = list(range(1, len(SERVOS) + 1))
     reads = sdk.GroupSyncRead(line, packet, SERVO.position.address, SERVO.position.size)
     writes = sdk.GroupSyncWrite(line, packet, SERVO.target.address, SERVO.target.size)

@@ -190,6 +190,8 @@ class ListeningBus(InProcessBus):
 
     def silence(self) -> str:
         """Why no joint of the arm is heard, in one line."""
+        if self._open:
+            return "; ".join((f"no message comes any more: {self._source.absence()}", *self.said()))
         if self._foreign:
             named, ours = list(self._foreign), ", ".join(self._place)
             more = f" and {len(named) - MOST_FOREIGN} others" if len(named) > MOST_FOREIGN else ""

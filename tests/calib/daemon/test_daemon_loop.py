@@ -19,6 +19,7 @@ from fast_daemon import settings
 
 from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
+from armlink.bus.listening.joint_messages import JointStateMessage, ListeningBus
 from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
@@ -317,3 +318,43 @@ def test_the_bus_process_logs_as_the_daemon_does(tmp_path: Path) -> None:
     command = [sys.executable, "-c", program, f"udp_multicast:239.74.171.{os.getpid() % 200 + 1}"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stderr.splitlines()
     assert any("there is no current calibration record" in json.loads(line)["message"] for line in said)
+
+
+class TellingProgram:
+    """A program that tells of every joint 50 times a second for a while, and then no more."""
+
+    lost, time = 0, 100.0
+
+    def __init__(self, names: tuple[str, ...], seconds: float) -> None:
+        self.names, self.times = names, deque(100.0 + 0.02 * np.arange(round(50 * seconds)))
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, instant: float) -> None:
+        self.time = max(self.time, instant)
+
+    def take(self) -> list[JointStateMessage]:
+        zeros, found = [0.0] * len(self.names), []
+        while self.times and self.times[0] <= self.time:
+            t = float(self.times.popleft())
+            found.append(JointStateMessage("driver", t, t, self.names, zeros, zeros, zeros))
+        return found
+
+    def absence(self) -> str:
+        return "does the driver run?"
+
+    def close(self) -> None: ...
+
+
+def test_messages_of_another_program_are_batches_and_their_end_is_said() -> None:
+    arm = load_arm("sarcos")
+    source = TellingProgram(arm.joint_names, 2.0)
+    bus = ListeningBus(source, "ros2:/joint_states", arm.joint_names, clock=source)
+    loop = InlineLoop(arm, lambda: bus, listen_only=True)
+    messages = [message for _ in range(30) for message in loop.pump()]
+    loop.close()
+    assert isinstance(messages[0], Up)
+    assert sum(len(message.t) for message in messages if isinstance(message, Batch)) == 99  # the last is not complete
+    (silent,) = (message for message in messages if isinstance(message, Down))
+    assert silent.reason == "ros2:/joint_states: no message comes any more: does the driver run?"
