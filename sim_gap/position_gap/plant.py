@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -324,13 +323,18 @@ class MovedModel:
 
 def follow(given: Array, before: Array, most: Array) -> Array:
     """A command (T, n) that changes by at most `most` from step to step, from `before` on, (n,) each."""
-    edges = [0, *(np.flatnonzero(np.any(np.diff(given, axis=0) != 0.0, axis=1)) + 1).tolist(), len(given)]
-    out, last = np.empty_like(given), before
-    for first, end in pairwise(edges):  # the command stays between them
-        away = last - given[first]
-        left = np.abs(away) - most * np.arange(1.0, end - first + 1)[:, None]
-        out[first:end] = given[first] + np.copysign(np.maximum(left, 0.0), away)
-        last = out[end - 1]
+    out = given.copy()
+    for j in np.flatnonzero(np.isfinite(most)).tolist():
+        command, step, last = given[:, j], float(most[j]), float(before[j])
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(command)) + 1, [len(command)]])
+        goals, counts = command[edges[:-1]], np.diff(edges)  # the command stays between them
+        reached = [last]
+        for goal, way in zip(goals.tolist(), (step * counts).tolist(), strict=True):
+            last = min(max(goal, last - way), last + way)
+            reached.append(last)
+        away = np.repeat(np.array(reached[:-1]) - goals, counts)
+        left = np.abs(away) - step * (np.arange(len(command)) - np.repeat(edges[:-1], counts) + 1.0)
+        out[:, j] += np.copysign(np.maximum(left, 0.0), away)
     return out
 
 

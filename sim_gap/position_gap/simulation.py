@@ -82,9 +82,10 @@ class World:
         spring = np.where(plant.driven, 0.0, self.point["kp"] * self.point["gain"] * self.scale)
         loose, held = not plant.driven.all(), bool(plant.held.places.size)
         given = self.given[:, plant.driven] * plant.gear[plant.driven]
+        position, control, places, controls = d.qpos, d.ctrl, _slice_of(plant.places), _slice_of(plant.controls)
         for first, last in pairwise(self._edges()):  # between them the command does not change
-            self.track[first] = d.qpos[plant.places]
-            d.ctrl[plant.controls] = given[first]
+            self.track[first] = position[places]
+            control[controls] = given[first]
             if loose:
                 d.qfrc_applied[plant.dofs] = self.applied + spring * self.given[first]
             if not held:

@@ -20,9 +20,8 @@ from sim_gap.position_gap.plant import MovedModel, Piece
 from sim_gap.residuals.preprocess import low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0
-"""Judged length of a window, and the simulated time before it that is not judged [s]."""
-SHORT_S = 3.0
-"""Length of a piece that begins as it was recorded and is judged from there [s]; longer ones have a time to warm."""
+"""Judged length of a window, and the simulated time before it that is not judged [s]; a piece that is not as long as a
+window begins as it was recorded and is judged from there."""
 LEAST_S = 0.2
 """Length of a piece that shows any motion [s]."""
 JUDGED_HZ = 50.0
@@ -39,8 +38,6 @@ SLOPE_NOISE = np.sqrt(26.0) / 2.0
 """Noise of the slope at the first of three positions, over that of a position and the time between them."""
 NOISE_SIZES = 3.0
 """Standard deviations of noise that a velocity has to exceed."""
-NORMAL_MEDIAN = 0.6745
-"""Median of the amount of a standard normal value."""
 MOVES, FAST = 0.5, 0.8
 """Shares of a joint's largest RMS speed and largest speed of all windows that it has to have in one that is fitted."""
 
@@ -215,12 +212,12 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
     error = np.where(served, np.where(served, given, 0.0) - filled, 0.0)
     sums = np.vstack([np.zeros((1, arm.n)), np.cumsum(error[:-1] * np.diff(t)[:, None], axis=0)])
     stride = max(1, round(1.0 / (JUDGED_HZ * period_of(part))))
-    short = t[-1] < SHORT_S
+    short = t[-1] < WINDOW_S
     warm, out, begin = 0.0 if short else WARM_S, [], 0.0
     while begin + warm < t[-1] - min(0.5, 0.5 * t[-1]):
         first = int(np.searchsorted(t, begin - 1e-9))
         rows = np.arange(int(np.searchsorted(t, t[first] + warm - 1e-9)), len(t), stride)
-        rows = rows[t[rows] < t[first] + warm + (SHORT_S if short else WINDOW_S)]
+        rows = rows[t[rows] < t[first] + warm + WINDOW_S]
         rows = rows[1:] if short else rows
         if not len(rows):
             break
@@ -243,7 +240,7 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
                 "recording": number,
             }
         )
-        begin = t[first] + (SHORT_S if short else WINDOW_S)
+        begin = t[first] + WINDOW_S
     return _piece(sim, part, q0, v0), out
 
 
@@ -252,7 +249,7 @@ def _noise(q: Array) -> Array:
     bent = np.diff(q, 4, axis=0)  # of white noise it has 70 times the variance (the sum of squared binomials)
     if not len(bent):
         return np.zeros(q.shape[1])
-    return np.asarray(np.median(np.abs(bent), axis=0) / np.sqrt(70.0) / NORMAL_MEDIAN)
+    return np.asarray(1.4826 * np.median(np.abs(bent), axis=0) / np.sqrt(70.0))
 
 
 def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:

@@ -23,8 +23,9 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.native_drives import hold
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.position_files import export_batched
-from sim_gap.position_gap.training.replay import OPENING_S, Simulated, actuator_of, commanded_rows, replay
+from sim_gap.position_gap.training.replay import Simulated, actuator_of, commanded_rows, replay
 from sim_gap.position_gap.training.spread import draw
+from sim_gap.position_gap.windows import WARM_S
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""
@@ -118,7 +119,7 @@ def main() -> None:
     rows = int(np.searchsorted(t, t[0] + given.seconds))
     started = time.process_time()
     theirs = warp_replay(model, list(found.sim.joints), recording, rows)
-    judged = t[:rows] >= t[0] + OPENING_S
+    judged = t[:rows] >= t[0] + WARM_S
     gaps = [np.sqrt(np.mean((x[:rows] - measured[:rows])[judged] ** 2, axis=0)) for x in (ours, theirs)]
     apart = np.sqrt(np.mean((ours[:rows] - theirs)[judged] ** 2, axis=0))
     print(f"MuJoCo {gaps[0]} rad, MuJoCo Warp {gaps[1]} rad, apart {apart} rad, {time.process_time() - started:.0f} s")

@@ -16,11 +16,8 @@ from sim_gap.position_gap.choice import without_group
 from sim_gap.position_gap.fit import Group, LoopSearch
 from sim_gap.position_gap.plant import HeldParts, held_model, silent
 from sim_gap.position_gap.training.export import Exported, export_beside_module
-from sim_gap.position_gap.windows import LEAST_S, pieces_of
-from sim_gap.position_gap.windows import SHORT_S as SHORT_PIECE_S
+from sim_gap.position_gap.windows import LEAST_S, WARM_S, WINDOW_S, pieces_of
 
-OPENING_S = 1.0
-"""Time at the start that is not judged [s]."""
 LONGEST_S = 60.0
 """Longest part of a recording that is replayed [s]."""
 SHORT_S, EACH_S = 15.0, 5.0
@@ -140,7 +137,7 @@ def replay_rms(
 
 def judged_rows(t: Array) -> Mask:
     """Replayed rows that are judged, (K,): those after the opening, or of a short part all but the first."""
-    opening = OPENING_S if t[-1] - t[0] >= SHORT_PIECE_S else 0.0
+    opening = WARM_S if t[-1] - t[0] >= WINDOW_S else 0.0
     return np.asarray(t - t[0] > opening - 1e-9) & (np.arange(len(t)) > 0)
 
 
