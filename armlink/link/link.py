@@ -29,9 +29,10 @@ from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges, requ
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
-from armlink.link.joints.groups import Group, by_joint, make_groups
+from armlink.link.joints.groups import Group, by_joint, make_groups, traits_of
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
+from armlink.link.keeper import Keeper
 from armlink.link.park import falling, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.termination import Presses, said
@@ -59,11 +60,17 @@ class Link(Calibrations):
     """
 
     def __init__(
-        self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None, overloaded: str = ""
+        self,
+        arm: ArmFile,
+        bus: "CanBus | can.BusABC",
+        clock: Clock | None = None,
+        overloaded: str = "",
+        spec: str | None = None,
     ) -> None:
         """Take `bus` (python-can's too, closed on leaving) and a clock: by default the bus's own or the machine's.
 
-        `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`).
+        `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`). `spec` names
+        the bus for a keeper, which opens it too; None: the arm file's.
         """
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
@@ -92,7 +99,7 @@ class Link(Calibrations):
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self.last: Command | None = None
         self._hold: ArmHold | None = None
-        self._overloaded = overloaded
+        self._overloaded, self._spec = overloaded, spec
         self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
         """Told what start() does with an arm that is out."""
 
@@ -101,7 +108,7 @@ class Link(Calibrations):
         """Open the bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput or BusFault."""
         from armlink.bus.open import open_link_bus
 
-        return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus))
+        return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus), spec=bus)
 
     def __enter__(self) -> Self:
         return self
@@ -121,6 +128,8 @@ class Link(Calibrations):
                 with Presses() as presses:
                     end(self, cause, said(self.arm.name, presses, logging.INFO if self._lock_step else logging.WARNING))
         finally:
+            if self._loop.keeper is not None:
+                self._loop.keeper.close()
             self.bus.shutdown()
             if self._hold is not None:
                 self._hold.release()
@@ -320,6 +329,7 @@ class Link(Calibrations):
         """
         self._require_start()
         require_deadman(self)
+        self._start_keeper()
         self._forget()
         self.commander.settle()
         self.turns.require(positions_before_power(self.commander, self.set_up_positions.tolist(), self._since))
@@ -334,6 +344,17 @@ class Link(Calibrations):
         self._enabled, self._held = True, False
         self.last = Command.hold(np.array(self._loop.latest_position))
         return sample
+
+    def _start_keeper(self) -> None:
+        """Have a process watch this one, where drives would keep on with their last command; raises Refused.
+
+        A simulated arm inside this process ends with it.
+        """
+        loop = self._loop
+        if self._lock_step or not self.section.keeper or not any(each.kept for each in traits_of(self.groups)):
+            return
+        if loop.keeper is None or loop.keeper.lost:
+            loop.keeper = Keeper(self.section, self._spec)
 
     def recover(self) -> Sample:
         """After a Stall: bring drives back that left the communication, and enable every joint where it stands."""
