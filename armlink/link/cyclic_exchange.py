@@ -14,9 +14,10 @@ from armlink.bus.port import BUS_SHIFT, Frame, Port
 from armlink.clock import Clock
 from armlink.drives.base import ANY
 from armlink.drives.board import Board, DriveEvent
-from armlink.drives.orders import Order, Reading, power_code
-from armlink.errors import BusFault, HostLate
+from armlink.drives.orders import Order, Power, Reading, law_torque, power_code
+from armlink.errors import BusFault, HostLate, Refused
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
+from armlink.link.gate import EXACT
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
 from armlink.link.keeper import Keeper
@@ -301,13 +302,20 @@ class Loop:
         return frames
 
     def _safe_frames(self) -> list[Frame]:
-        """Of drives that would keep on with their last command; what they order is checked like what leaves."""
+        """Of drives that keep on with their last command. Raises Refused where their bytes order more than a limit
+        of the drive, by its newest readings."""
         found = list[Frame]()
         for group in self.groups:
-            for joint, place in enumerate(group.places):
-                for can_id, data in group.drives.safe_frames(joint):
-                    for _, order in group.drives.commands_of(can_id, data):
-                        self.verify(place, self.values.ordered(place, order))
+            drives = group.drives
+            for joint in range(len(group.places)):
+                for can_id, data in drives.safe_frames(joint):
+                    for _, order in drives.commands_of(can_id, data):
+                        known, limits = drives.memory[joint], drives.limits_of(joint)
+                        torque = law_torque(order, known.position, known.velocity)
+                        inside = limits.lower <= order.position <= limits.upper or not order.kp > 0
+                        within = inside and abs(torque) <= EXACT * limits.max_torque
+                        if order.power is Power.ON and not within:
+                            raise Refused(f"keeper: the frame to {drives.where(joint)} is beyond a limit: not kept")
                     found.append((can_id | group.tag, data))
         return found
 

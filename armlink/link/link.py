@@ -46,6 +46,9 @@ PATIENCE = 2.5
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Another host is listened for before anything is sent to the nodes: this many periods, and at least this long [s],
 since a host on a busy computer may pause for some 0.05 s."""
+BACKLOGS = 5
+"""So often all frames that are there are taken in before the start: drives that send by their own clock go on while a
+busy computer has not read them yet."""
 ANSWER_SECONDS = 5.0
 """After a stall a controller may take so long to answer [s]."""
 R = TypeVar("R")
@@ -236,7 +239,11 @@ class Link(Calibrations):
 
     def require_alone(self) -> None:
         """Listen before anything is set; raises BusFault where another host is on the bus."""
-        self._loop.drain()
+        for _ in range(BACKLOGS):
+            self._loop.watch.clear()
+            self._loop.drain()
+            if not self._loop.watch.flooded:
+                break
         self._loop.watch.clear()
         for group in self.groups:
             group.drives.forget(restarts=True)

@@ -98,12 +98,13 @@ def test_torques_of_old_firmware_are_scaled_by_four_at_the_first_three_joints(jo
 def test_a_command_is_packed_as_the_stock_client_packs_it_but_rounded_to_the_nearest_step():
     grid = frames.PiperGrid(1.0)
     for values in ((1.0, -2.0, 30.0, 0.5, 1.5), (-3.0, 0.0, 500.0, 5.0, -8.0), (12.5, 45.0, 0.0, 0.02, 8.0)):
-        steps = grid.steps(MitCommand(*values))
-        told = tuple(frames.unpack_mit(frames.pack_mit(*steps)))
-        assert told == pytest.approx(tuple(grid.command(*steps)))
+        packed = grid.steps(MitCommand(*values))
+        told = tuple(frames.unpack_mit(frames.pack_mit(*packed)))
+        assert told == pytest.approx(tuple(grid.command(*packed)))
         assert told == pytest.approx(values, abs=500 / 4095 / 2 + 1e-9)
-    near = [a ^ b for a, b in zip(frames.pack_mit(*grid.steps(MitCommand(0, 0, 10, 0.8, 1.5))), mit(0, 0, 10, 0.8, 1.5))]
-    assert max(near[:6]) <= 1  # the last step of each field, and with it the checksum
+        theirs = frames.unpack_mit(mit(*values))
+        steps = (25 / 65535, 90 / 4095, 500 / 4095, 10 / 4095, 16 / 255)
+        assert (np.abs(np.subtract(told, theirs)) <= np.array(steps) + 1e-9).all()
 
 
 def test_no_kd_pushes():
@@ -121,7 +122,7 @@ def test_who_it_is_and_where_it_stands():
     assert {can_id for can_id, _ in bench.log} == {0x4AF}
     bench.simulated[0].firmware = "S-V1.9-0"
     assert "its firmware is S-V1.9-0, the arm file states S-V1.6-3" in bench.drives.identify(bench)[2].mismatch
-    with pytest.raises(Refused, match="base: the arm's firmware is S-V1.9-0, the arm file states S-V1.6-3"):
+    with pytest.raises(Refused, match=r"base: the arm's firmware is S-V1\.9-0"):
         bench.set_up()
 
 
@@ -129,7 +130,7 @@ def test_an_arm_with_power_is_not_set_up_since_it_would_fall():
     bench = Bench("six-piper")
     bench.set_up()
     assert bench.walk()
-    with pytest.raises(Refused, match="base: it has power: .* support the arm"):
+    with pytest.raises(Refused, match=r"base: it has power: .* support the arm"):
         Bench.set_up(bench)
     assert all(bench.powered)
 
@@ -214,7 +215,7 @@ def test_without_a_keeper_it_gets_no_power():
     simulated = SimulatedArm(arm, Truth.of(arm))
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
-        with pytest.raises(Refused, match="base: if this host dies, its drive keeps on .* `link.keeper: true`"):
+        with pytest.raises(Refused, match=r"base: if this host dies, its drive keeps on .* `link.keeper: true`"):
             link.enable()
     assert not any(simulated.device(joint).motor.powered for joint in range(6))
 

@@ -202,7 +202,9 @@ def test_an_error_of_the_way_to_park_lets_the_arm_down(monkeypatch, caplog):
 
 
 @pytest.mark.sample(1)
-@pytest.mark.parametrize("name", [name for name in FALLING if name not in ("six-cubemars", "six-myactuator", "six-piper")])
+@pytest.mark.parametrize(
+    "name", [name for name in FALLING if name not in ("six-cubemars", "six-myactuator", "six-piper")]
+)
 def test_a_drive_that_stops_by_itself_is_caught(name):
     """CubeMars and MyActuator drives make torque again at the next command, and a Piper's does not stop by itself."""
     bench = EndsBench(name)
