@@ -47,6 +47,8 @@ def _round(made: Mapping[str, Any]) -> str:
     lines.append("| answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |")
     lines += ["", "Decided:", "", *_decided(found)]
     for key, counted in made["no_worse"].items():
+        if not counted[1]:
+            continue
         title = next(score.title for score in SCORES if score.key == key)
         lines += ["", f"armlink, {title}: at most 5 % above the best other tool in {counted[0]} of {counted[1]} cases."]
     missing = {row["tool"]: row["why"] for row in made["rows"] if row["state"] == "not installed"}
