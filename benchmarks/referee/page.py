@@ -11,7 +11,7 @@ from referee.score import SCORES, Score
 BEGIN, END = "<!-- begin: written by make referee -->", "<!-- end: written by make referee -->"
 ROW_PX, LABEL_PX, PANEL_PX, GAP_PX, HEAD_PX = 18, 120, 210, 24, 34
 PANELS_A_ROW = 3
-LEAST_LOG = 0.02
+LEAST_LOG = 0.001
 """Left end of a panel of ratios, which is logarithmic."""
 
 
@@ -123,7 +123,7 @@ def _panel(summary: Mapping[str, Any], score: Score) -> list[str]:
         return LABEL_PX + PANEL_PX * max(math.log(max(value, LEAST_LOG) / LEAST_LOG) / math.log(most / LEAST_LOG), 0.0)
 
     bottom, out = HEAD_PX + ROW_PX * len(tools), []
-    for mark in (0.0, 0.5, 1.0) if score.share else (0.1, 1.0):
+    for mark in (0.0, 0.5, 1.0) if score.share else (0.01, 0.1, 1.0):
         text = f"{100 * mark:.0f} %" if score.share else f"{mark:g}"
         at = f"{place(mark):.1f}"
         out.append(f'<line x1="{at}" y1="20" x2="{at}" y2="{bottom}" stroke="#ddd"/>')
