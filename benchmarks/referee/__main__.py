@@ -15,7 +15,7 @@ def main() -> int:
     """Play the rounds that are asked for, and write the tables."""
     parser = argparse.ArgumentParser(prog="make referee", description=__doc__)
     today = int(datetime.now(UTC).strftime("%Y%m%d"))
-    parser.add_argument("--cases", type=int, default=33, help="cases of a round")
+    parser.add_argument("--cases", type=int, default=66, help="cases of a round")
     parser.add_argument("--seed", type=int, nargs="+", default=[today], help="a round each; by default that of the day")
     parser.add_argument("--only", nargs="+", default=[], help="names of the tools that take part")
     parser.add_argument("--adapter", type=Path, nargs="+", default=[], help="further adapters")

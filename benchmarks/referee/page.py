@@ -11,7 +11,7 @@ from referee.score import SCORES, Score
 BEGIN, END = "<!-- begin: written by make referee -->", "<!-- end: written by make referee -->"
 ROW_PX, LABEL_PX, PANEL_PX, GAP_PX, HEAD_PX = 18, 120, 210, 24, 34
 PANELS_A_ROW = 3
-LEAST_LOG = 0.02
+LEAST_LOG = 0.001
 """Left end of a panel of ratios, which is logarithmic."""
 
 
@@ -47,6 +47,8 @@ def _round(made: Mapping[str, Any]) -> str:
     lines.append("| answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |")
     lines += ["", "Decided:", "", *_decided(found)]
     for key, counted in made["no_worse"].items():
+        if not counted[1]:
+            continue
         title = next(score.title for score in SCORES if score.key == key)
         lines += ["", f"armlink, {title}: at most 5 % above the best other tool in {counted[0]} of {counted[1]} cases."]
     missing = {row["tool"]: row["why"] for row in made["rows"] if row["state"] == "not installed"}
@@ -121,7 +123,7 @@ def _panel(summary: Mapping[str, Any], score: Score) -> list[str]:
         return LABEL_PX + PANEL_PX * max(math.log(max(value, LEAST_LOG) / LEAST_LOG) / math.log(most / LEAST_LOG), 0.0)
 
     bottom, out = HEAD_PX + ROW_PX * len(tools), []
-    for mark in (0.0, 0.5, 1.0) if score.share else (0.1, 1.0):
+    for mark in (0.0, 0.5, 1.0) if score.share else (0.01, 0.1, 1.0):
         text = f"{100 * mark:.0f} %" if score.share else f"{mark:g}"
         at = f"{place(mark):.1f}"
         out.append(f'<line x1="{at}" y1="20" x2="{at}" y2="{bottom}" stroke="#ddd"/>')

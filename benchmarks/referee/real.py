@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from armlink.errors import ArmlinkError
@@ -28,15 +29,17 @@ LEAST_S = 6.0
 
 
 def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[str, str]:
-    """Write the cases whose files are there; names and hashes of the sealed parts. Arms that no MJCF of joints and
-    columns in one order describes are left out."""
+    """Write the cases whose files are there; names and hashes of the sealed parts. Arms whose
+    model is no MJCF that is complete by itself are left out."""
     hashes = {}
     for known in read_cases(KNOWN):
         name = f"real_{known['case']}"
         try:
             train, heldout, _ = recordings_of(folder, known)
             model = load_model(str(folder / known["sim"]), (), train[0].n)
-        except (ArmlinkError, OSError):
+            text = (folder / known["sim"]).read_text(encoding="utf-8")
+            mujoco.MjModel.from_xml_string(text)
+        except (ArmlinkError, OSError, ValueError):
             continue
         if known.get("refused") or not heldout or np.ptp(heldout[0].t) < LEAST_S:
             continue
@@ -46,7 +49,7 @@ def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[s
             "torque" if first.torque is not None else "motor_torque" if first.motor_torque is not None else "positions"
         )
         place.mkdir()
-        (place / "sim.xml").write_text((folder / known["sim"]).read_text(encoding="utf-8"), encoding="utf-8")
+        (place / "sim.xml").write_text(text, encoding="utf-8")
         for k, recording in enumerate(train, start=1):
             write_csv(place / f"train_{k}.csv", columns_of(recording))
         told = {"joints": joints, "kind": kind, "withheld": [], "cpu_seconds": cpu_seconds}
