@@ -41,10 +41,12 @@ def diagnose(
         heldout: recordings to judge on, which the fit does not see; by default the end of each training recording.
         base: body of the model that carries the recorded arm, such as a torso; by default the world.
         tip: body of the model that the recorded arm ends in, if it has several arms.
-        units, sign, zero, clock: of columns or channels, as the options of `armlink gap diagnose` have them:
-            `units={"q": "deg", "tau": "A:2.1"}`, `sign={"tau_3": -1}`, `zero={"q_2": 1.571}` [rad],
-            `clock={"tau": 0.02}` [s].
-        columns: as `--map`, for a table with other names; joints: the recorded joints in the model's order.
+        units: of columns or channels, as `armlink gap diagnose --units` has them: `{"q": "deg", "tau": "A:2.1"}`.
+        sign: as `--sign`: `{"tau_3": -1}`.
+        zero: as `--zero`: `{"q_2": 1.571}` [rad].
+        clock: as `--clock`: `{"tau": 0.02}` [s].
+        columns: as `--map`, for a table with other names.
+        joints: the recorded joints in the model's order.
         effort_is: whether the torque channel is of the motor or the link, and whether gravity is missing in it.
         topic: the joint states in a bag.
 
