@@ -18,7 +18,7 @@ LEAST_REACH = 0.05
 """Distance of a link's mass from its axis, at least [m]."""
 MASS_DOUBT, PLACE_DOUBT = 0.2, 0.3
 """Standard deviations of a model's masses, as a share, and of centres and radii of gyration, as a share of a link's
-length: makers' models were found wrong by as much (UR10e and Panda; docs/external-torque.md)."""
+length; a choice, which a baseline corrects."""
 
 
 _MOTOR = MotorDoubt()

@@ -364,8 +364,8 @@ def failed(name: str, outcomes: list[Outcome]) -> list[str]:
     )
     hours = sum(o.hours for o in outcomes)
     wrong += [f"{name}: {false} false alarms in {hours:.1f} h"] * (false > max(1.0, hours))
-    wrong += [f"{name}: {found} of {pushed} pushes found"] * (found < FOUND * pushed)
-    wrong += [f"{name}: {right} of {found} on the right link"] * (right < RIGHT_LINK * found)
+    wrong += [f"{name}: {found} of {pushed} pushes found"] * bool(found < FOUND * pushed)
+    wrong += [f"{name}: {right} of {found} on the right link"] * bool(right < RIGHT_LINK * found)
     wrong += [f"{name}: {contacts} loads called contact"] * (contacts > 0)
     for other in ("nominal", "calibrated"):
         ratio = float(np.median([o.needed["ours"] / o.needed[other] for o in outcomes]))
