@@ -11,7 +11,7 @@ from calib.commands.options import JsonFile, Store, Tool
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
     from calib.external.arm_model import ArmRecords
-    from calib.external.listening import Frame, Heard
+    from calib.external.listening import Heard, WrenchFrame
 
 
 @reads_recordings
@@ -92,7 +92,7 @@ def external(
         draw_map(picture, places, force, f"{arm}: smallest force at {names[place.link]} found in 95 %, at rest")
         console.print(f"{picture}: half of the workspace needs {np.median(force):.1f} N or less")
     if out is not None:
-        save_heard(out, every, names)
+        save_heard(out, every, names, "base")
     write_json(
         json_file,
         {
@@ -122,19 +122,19 @@ def parse_rate(text: str) -> float:
     return rate
 
 
-def parse_frame(text: str | None, records: "ArmRecords") -> "Frame":
+def parse_frame(text: str | None, records: "ArmRecords") -> "WrenchFrame":
     """The frame of an option `--frame`; raises BadInput."""
     import numpy as np
 
     from armlink.errors import BadInput
-    from calib.external.listening import Frame
+    from calib.external.listening import WrenchFrame
 
     arm, file = records.stated.arm, records.stated.arm_file
     if text is None:
         if file is not None and file.tool is not None:
-            return Frame(arm.n - 1, np.array(file.tool.centre))
+            return WrenchFrame(arm.n - 1, np.array(file.tool.centre))
         last = records.links[-1]
-        return Frame(arm.n - 1, last[1:4] / last[0] if last[0] > 0.0 else np.zeros(3))
+        return WrenchFrame(arm.n - 1, last[1:4] / last[0] if last[0] > 0.0 else np.zeros(3))
     name, *numbers = text.split(",")
     try:
         point = np.array([float(each) for each in numbers])
@@ -143,7 +143,7 @@ def parse_frame(text: str | None, records: "ArmRecords") -> "Frame":
     if name not in arm.names or len(point) not in (0, 3) or not np.isfinite(point).all():
         known = ", ".join(arm.names)
         raise BadInput(f"--frame {text}: expected JOINT or JOINT,X,Y,Z with one of the joints {known}")
-    return Frame(arm.names.index(name), point if len(point) else np.zeros(3))
+    return WrenchFrame(arm.names.index(name), point if len(point) else np.zeros(3))
 
 
 def _records(arm: str, base: str | None, tip: str | None, tool: str | None, store: str | None) -> "ArmRecords":

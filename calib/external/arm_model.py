@@ -14,7 +14,7 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.load import bar_inertials
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
-from gcomp.external.external_model import ROWS_RATE, ExternalModel, Prior, from_records, learn
+from gcomp.external.external_model import ROWS_RATE, ArmPrior, ExternalModel, from_records, learn
 from gcomp.external.filtered_rows import Samples
 from gcomp.external.rigid_motion import INERTIAL
 
@@ -65,8 +65,8 @@ class ArmRecords:
 
 
 @dataclass(frozen=True, eq=False)
-class Listener:
-    """What turns recordings of one arm into samples of its model."""
+class ArmListener:
+    """Turns recordings of one arm into samples of its model."""
 
     model: ExternalModel
     records: ArmRecords
@@ -88,7 +88,7 @@ def channel_of(recordings: Sequence[Recording]) -> str:
 
 def listener_of(
     records: ArmRecords, baselines: Sequence[Recording], recordings: Sequence[Recording], channel: str | None = None
-) -> Listener:
+) -> ArmListener:
     """Learned from `baselines`; without any, by the records alone. Raises BadInput where joints do not fit."""
     arm = records.stated.arm
     every = [*baselines, *recordings]
@@ -106,10 +106,10 @@ def listener_of(
     scale = _scale(records, runs or samples(recordings))
     prior = prior_of(records, channel, scale)
     model = learn(arm, prior, runs, rate, scale) if runs else from_records(arm, prior, scale)
-    return Listener(model, records, channel, rate, warm)
+    return ArmListener(model, records, channel, rate, warm)
 
 
-def prior_of(records: ArmRecords, channel: str, scale: Array) -> Prior:
+def prior_of(records: ArmRecords, channel: str, scale: Array) -> ArmPrior:
     """Before any work of the arm's own; `scale` (n,) [N·m] is that of its joints' torques."""
     arm, links = records.stated.arm, records.links
     prior = prior_of_model(arm, links, LINK if channel == "torque" else MOTOR, scale)

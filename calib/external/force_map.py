@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from armlink.content.atomic_file import write_whole
-from calib.external.listening import Frame
+from calib.external.listening import WrenchFrame
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactDetector
 from gcomp.external.external_model import ExternalModel, joined
@@ -22,7 +22,7 @@ COLOURS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231,
 """From the smallest force to the largest: viridis (matplotlib)."""
 
 
-def smallest_forces(model: ExternalModel, frame: Frame, per_hour: float) -> tuple[Array, Array]:
+def smallest_forces(model: ExternalModel, frame: WrenchFrame, per_hour: float) -> tuple[Array, Array]:
     """(Places (K, 2): distance from the first axis' origin and height against gravity [m]; forces (K,) [N]) at rest."""
     arm, random = model.arm, np.random.default_rng(1)
     low, high = (np.clip(each, -np.pi, np.pi) for each in (arm.lower, arm.upper))

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.recording.recording import Recording
-from calib.external.arm_model import Listener
+from calib.external.arm_model import ArmListener
 from gcomp.arrays import Array
-from gcomp.external.contact import ContactDetector, ContactEvent, Judged
+from gcomp.external.contact import ContactDetector, ContactEvent, JudgedRows
 from gcomp.external.external_model import CHUNK
 from gcomp.external.wrench import Wrench, smallest_force, wrench
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class WrenchFrame:
     """Where a wrench is told: a point of a link's bar frame."""
 
     link: int
@@ -30,7 +30,7 @@ class Heard:
     """(S,) [s]."""
     position: Array
     """(S, n) [rad]."""
-    judged: Judged
+    judged: JudgedRows
     wrench: Wrench
     least_force: tuple[Array, Array]
     """Force at the frame that would be found [N], along the direction felt best and the one felt worst (S,)."""
@@ -39,7 +39,7 @@ class Heard:
     """Mass [kg] and first moment [kg·m] that the arm was found to carry at the end (4,)."""
 
 
-def listen(listener: Listener, recording: Recording, frame: Frame, per_hour: float) -> Iterator[Heard]:
+def listen(listener: ArmListener, recording: Recording, frame: WrenchFrame, per_hour: float) -> Iterator[Heard]:
     """Each stretch of a recording without a gap is judged on its own."""
     model = listener.model
     for t, samples in listener.samples(recording):
@@ -59,7 +59,9 @@ def listen(listener: Listener, recording: Recording, frame: Frame, per_hour: flo
         yield Heard(
             _joined([each[0] for each in parts]),
             _joined([each[1] for each in parts]),
-            Judged(*(_joined([getattr(each[2], name) for each in parts]) for name in Judged.__dataclass_fields__)),
+            JudgedRows(
+                *(_joined([getattr(each[2], name) for each in parts]) for name in JudgedRows.__dataclass_fields__)
+            ),
             _joined_wrench([each[3] for each in parts]),
             (_joined([each[4][0] for each in parts]), _joined([each[4][1] for each in parts])),
             [event for each in parts for event in each[5]],

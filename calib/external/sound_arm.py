@@ -1,4 +1,4 @@
-"""What is believed of an arm before its own work is seen: its records, its model, and what sound arms lack."""
+"""The belief about an arm before its own work is seen: its records, its model, and what sound arms lack."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
-from gcomp.external.external_model import Prior
+from gcomp.external.external_model import ArmPrior
 from gcomp.external.filtered_rows import JOINT_COLUMNS, WAVES
 from gcomp.external.rigid_motion import INERTIAL, gravity_split
 from gcomp.identify.motor_model import MotorDoubt
@@ -18,7 +18,7 @@ LEAST_REACH = 0.05
 """Distance of a link's mass from its axis, at least [m]."""
 MASS_DOUBT, PLACE_DOUBT = 0.2, 0.3
 """Standard deviations of a model's masses, as a share, and of centres and radii of gyration, as a share of a link's
-length: makers' models were found wrong by as much (UR10e and Panda; docs/external-torque.md)."""
+length; a choice, which a baseline corrects."""
 
 
 _MOTOR = MotorDoubt()
@@ -69,7 +69,7 @@ LINK = JointDoubt(0.03, 0.03, 0.02, 0.02, 0.002, 0.05, 0.01, 0.01)
 """Torque of a sensor beyond the transmission: bearings, seals and cables alone rub."""
 
 
-def prior_of_model(arm: Arm, links: Array, doubt: JointDoubt, scale: Array) -> Prior:
+def prior_of_model(arm: Arm, links: Array, doubt: JointDoubt, scale: Array) -> ArmPrior:
     """Of inertials (n, 10) in bar frames that nothing has confirmed."""
     n = arm.n
     mass = np.maximum(links[:, 0], LEAST_MASS * links[:, 0].sum())
@@ -80,20 +80,20 @@ def prior_of_model(arm: Arm, links: Array, doubt: JointDoubt, scale: Array) -> P
     std[:, 4:] = (PLACE_DOUBT * mass * reach**2)[:, None]
     back = np.linalg.inv(gravity_split(arm)) * std.ravel()
     joints_std = doubt.std(scale)
-    return Prior(links, back @ back.T, np.zeros_like(joints_std), joints_std, doubt.noise * scale)
+    return ArmPrior(links, back @ back.T, np.zeros_like(joints_std), joints_std, doubt.noise * scale)
 
 
-def with_gravity(prior: Prior, arm: Arm, gravity: GravityRecord, beta: Array) -> Prior:
+def with_gravity(prior: ArmPrior, arm: Arm, gravity: GravityRecord, beta: Array) -> ArmPrior:
     """With a record's mass moments in place of those of the links, `beta` (2 n,)."""
     n = arm.n
     links, covariance = prior.links.copy(), prior.covariance.copy()
     links[:, 1:3] += (np.array(gravity.beta) - beta).reshape(n, 2)
     covariance[: 2 * n] = covariance[:, : 2 * n] = 0.0
     covariance[: 2 * n, : 2 * n] = np.array(gravity.covariance)
-    return Prior(links, covariance, prior.joints, prior.joints_std, prior.noise)
+    return ArmPrior(links, covariance, prior.joints, prior.joints_std, prior.noise)
 
 
-def with_calibration(prior: Prior, calibration: CalibrationRecord) -> Prior:
+def with_calibration(prior: ArmPrior, calibration: CalibrationRecord) -> ArmPrior:
     """With a record's friction, and how sure it is of gains and offsets."""
     mean, std, noise = prior.joints.copy(), prior.joints_std.copy(), prior.noise.copy()
     at = {name: k for k, name in enumerate(JOINT_COLUMNS)}
@@ -112,4 +112,4 @@ def with_calibration(prior: Prior, calibration: CalibrationRecord) -> Prior:
         if joint.motor is not None:
             for name in ("coulomb", "load", "viscous"):
                 mean[j, at[name]], std[j, at[name]] = getattr(joint.motor, name)
-    return Prior(prior.links, prior.covariance, mean, std, noise)
+    return ArmPrior(prior.links, prior.covariance, mean, std, noise)

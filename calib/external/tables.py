@@ -1,6 +1,6 @@
 """External torque and wrench over time as tables and answers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from calib.external.listening import Heard
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactEvent
@@ -70,15 +71,27 @@ def columns_of(heard: Heard) -> dict[str, Array]:
     return columns
 
 
-def save_heard(path: Path, heard: Sequence[Heard], names: tuple[str, ...]) -> None:
-    """Write by suffix; raises BadInput."""
+def save_heard(path: Path, heard: Sequence[Heard], names: tuple[str, ...], frame_id: str) -> None:
+    """Write by suffix; `frame_id` names the frame whose axes a wrench is in. Raises BadInput."""
     if path.suffix == ".csv":
         parts = [columns_of(each) for each in heard]
         table = np.column_stack([np.concatenate([part[name] for part in parts]) for name in parts[0]])
         lines = [",".join("" if np.isnan(x) else f"{x:.9g}" for x in row) for row in table]
         write_whole(path, "\n".join([",".join(parts[0]), *lines]) + "\n")
         return
-    raise BadInput(f"{path}: this suffix is not one of .csv")
+    if path.suffix == ".mcap":
+        require_extra("--out", "bags")
+        from armlink.recording.wrench_bag import save_wrench_bag
+
+        def joined(of: Callable[[Heard], Array]) -> Array:
+            return np.concatenate([of(each) for each in heard])
+
+        save_wrench_bag(
+            path, joined(lambda each: each.t), names, joined(lambda each: each.judged.external),
+            joined(lambda each: each.judged.std), frame_id, joined(lambda each: each.wrench.value),
+        )  # fmt: skip
+        return
+    raise BadInput(f"{path}: this suffix is not one of .csv, .mcap")
 
 
 def _listed(values: Array) -> list[float]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from gcomp.estimate.posterior import linear_posterior
-from gcomp.external.external_model import BEGINNING, BLOCK, DRIFT, ROWS_RATE, SLOW, ExternalModel, Rows
+from gcomp.external.external_model import BEGINNING, BLOCK, DRIFT, ROWS_RATE, SLOW, ExternalModel, TorqueRows
 from gcomp.external.rigid_motion import INERTIAL, RigidMotion, jacobian
 
 FEWEST_MAXIMA = 5
@@ -46,7 +46,7 @@ WIDTH = 0.06
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """What begins to push the arm, or ends to."""
+    """A push that begins, or a load that changes."""
 
     t: float
     """When it began [s]."""
@@ -92,7 +92,7 @@ def threshold(maxima: Array, per_hour: float, joints: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedRows:
     """Rows beside what is expected of them."""
 
     external: Array
@@ -124,9 +124,9 @@ class ContactDetector:
         self._slow_columns: Array | None = None
         self._drift = np.zeros(n)
         self._seen = 0
-        self._open: _Open | None = None
+        self._open: _OpenEvent | None = None
 
-    def judge(self, t: Array, rows: Rows) -> tuple[Judged, list[ContactEvent]]:
+    def judge(self, t: Array, rows: TorqueRows) -> tuple[JudgedRows, list[ContactEvent]]:
         """Rows at times (S,) [s]."""
         model, events = self.model, list[ContactEvent]()
         own = model.model_variance(rows)
@@ -149,9 +149,9 @@ class ContactDetector:
                 rows.motion,
                 row,
             )
-        return Judged(external, std, change_std, deviation), events
+        return JudgedRows(external, std, change_std, deviation), events
 
-    def _change_std(self, rows: Rows) -> Array:
+    def _change_std(self, rows: TorqueRows) -> Array:
         """Standard deviation of the rows' change since before (S, n) [N·m]."""
         columns = np.concatenate([rows.by_link, rows.by_joint], axis=-1)
         away, share = np.empty_like(columns), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
@@ -162,7 +162,7 @@ class ContactDetector:
             count = self._seen + row - BEGINNING_ROWS + 1
             self._slow_columns = self._slow_columns + max(share, 1.0 / max(count, 1)) * away[row]
         shared = rows.by_link.shape[2]
-        change = Rows(rows.left, away[..., :shared], away[..., shared:], rows.state, rows.motion)
+        change = TorqueRows(rows.left, away[..., :shared], away[..., shared:], rows.state, rows.motion)
         return self.model.sudden.std(rows.state, self.model.model_variance(change))
 
     def _share(self) -> float:
@@ -184,7 +184,7 @@ class ContactDetector:
             begun = self._seen > 2 * BEGINNING_ROWS
             if deviation > self.lasting_limit or (begun and sudden > self.sudden_limit):
                 by_change = begun and sudden / self.sudden_limit >= deviation / self.lasting_limit
-                self._open = _Open(t, self._slow.copy() if by_change else 0.0 * external, by_change)
+                self._open = _OpenEvent(t, self._slow.copy() if by_change else 0.0 * external, by_change)
             else:
                 self._slow = self._slow + self._share() * (external - self._slow)
                 self._drift = self._drift + external / (DRIFT * ROWS_RATE)
@@ -200,7 +200,7 @@ class ContactDetector:
                 self._open, self._slow = None, external.copy()
 
     def _follow(
-        self, opened: "_Open", t: float, external: Array, std: Array, loaded: Array, motion: RigidMotion, row: int
+        self, opened: "_OpenEvent", t: float, external: Array, std: Array, loaded: Array, motion: RigidMotion, row: int
     ) -> Iterator[ContactEvent]:
         opened.rows.append((external - opened.before, std, loaded))
         opened.count += 1
@@ -218,7 +218,7 @@ class ContactDetector:
                 if opened.event.kind != kind:
                     yield replace(opened.event, kind=kind, mass=float(taken[0]), told=t, least_force=0.0)
 
-    def _decide(self, opened: "_Open", t: float, motion: RigidMotion, row: int) -> ContactEvent:
+    def _decide(self, opened: "_OpenEvent", t: float, motion: RigidMotion, row: int) -> ContactEvent:
         recent = opened.rows[-3:]
         change, std = np.mean([each[0] for each in recent], axis=0), recent[-1][1]
         spread = self.model.sudden if opened.by_change else self.model.lasting
@@ -244,7 +244,7 @@ class ContactDetector:
             float(weight[link] / weight.sum()), odds, least, mass, t,
         )  # fmt: skip
 
-    def _load(self, opened: "_Open") -> Array | None:
+    def _load(self, opened: "_OpenEvent") -> Array | None:
         """Load (4,) that explains all rows of an event, if one does."""
         change, std, columns = (np.array(each) for each in zip(*opened.rows, strict=True))
         change, std, columns = change[DECIDED:], std[DECIDED:], columns[DECIDED:]
@@ -268,7 +268,7 @@ class ContactDetector:
 
 
 @dataclass
-class _Open:
+class _OpenEvent:
     """An event that goes on."""
 
     t: float

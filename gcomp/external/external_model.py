@@ -1,4 +1,4 @@
-"""What an arm's torque is without contact, learned from the arm's own work: mean, covariance, and how often it strays.
+"""The torque of an arm without contact, learned from the arm's own work: mean, covariance, and how often it strays.
 
 The rows of `gcomp.external.filtered_rows` are linear in the parameters, which have a prior (the records, or the model
 with what sound arms lack) and are narrowed by recordings without contact. What is left over is judged by rows that the
@@ -36,7 +36,7 @@ SPEED, PUSH = 0.5, 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class ArmPrior:
     """Parameters before any recording: normal, as those of a sound arm of which this is known."""
 
     links: Array
@@ -56,7 +56,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class TorqueRows:
     """S rows of all joints."""
 
     left: Array
@@ -72,14 +72,16 @@ class Rows:
     def __len__(self) -> int:
         return len(self.left)
 
-    def part(self, rows: slice | Mask) -> "Rows":
-        return Rows(self.left[rows], self.by_link[rows], self.by_joint[rows], self.state[rows], self.motion.part(rows))
+    def part(self, rows: slice | Mask) -> "TorqueRows":
+        return TorqueRows(
+            self.left[rows], self.by_link[rows], self.by_joint[rows], self.state[rows], self.motion.part(rows)
+        )
 
 
-def rows_of(filtered: FilteredRows, split: Array, joints: Array) -> Rows:
+def rows_of(filtered: FilteredRows, split: Array, joints: Array) -> TorqueRows:
     own = filtered.joints[filtered.chosen]
     left = filtered.torque - filtered.links - (filtered.joints * joints).sum(-1)
-    return Rows(left[filtered.chosen], filtered.by_link @ split, own, _state(filtered), filtered.motion)
+    return TorqueRows(left[filtered.chosen], filtered.by_link @ split, own, _state(filtered), filtered.motion)
 
 
 def _state(filtered: FilteredRows) -> Array:
@@ -123,7 +125,7 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class ExternalModel:
-    """What a torque is expected to be, and how sure that is."""
+    """The torque that is expected, and how sure that is."""
 
     arm: Arm
     links: Array
@@ -156,10 +158,10 @@ class ExternalModel:
         """External torque at every sample (K, n) [N·m]: what the surroundings push the joints with."""
         return np.asarray(filtered.links + (filtered.joints * self.joints).sum(-1) - filtered.torque)
 
-    def rows(self, filtered: FilteredRows) -> Rows:
+    def rows(self, filtered: FilteredRows) -> TorqueRows:
         return rows_of(filtered, self.split, self.joints)
 
-    def model_variance(self, rows: Rows) -> Array:
+    def model_variance(self, rows: TorqueRows) -> Array:
         """Of the expected torque (S, n) [N²·m²]."""
         return model_variance(rows, self.factors)
 
@@ -168,14 +170,14 @@ def stride_of(rate: float) -> int:
     return max(1, round(rate / ROWS_RATE))
 
 
-def expected(rows: Rows, change: Array) -> Array:
+def expected(rows: TorqueRows, change: Array) -> Array:
     n = rows.left.shape[1]
     shared = INERTIAL * n
     own = change[shared:].reshape(n, -1)
     return np.asarray(rows.by_link @ change[:shared] + (rows.by_joint * own).sum(-1))
 
 
-def model_variance(rows: Rows, factors: Array) -> Array:
+def model_variance(rows: TorqueRows, factors: Array) -> Array:
     out = np.empty(rows.left.shape)
     for j, factor in enumerate(factors):
         out[:, j] = ((np.hstack([rows.by_link[:, j], rows.by_joint[:, j]]) @ factor) ** 2).sum(-1)
@@ -194,7 +196,7 @@ def _factors(covariance: Array, n: int) -> Array:
     return np.array(found)
 
 
-def from_records(arm: Arm, prior: Prior, scale: Array) -> ExternalModel:
+def from_records(arm: Arm, prior: ArmPrior, scale: Array) -> ExternalModel:
     """Without any work of the arm's own: the records' bounds alone, which nothing has proved."""
     n = prior.n
     covariance = _prior_covariance(prior)
@@ -209,7 +211,7 @@ def from_records(arm: Arm, prior: Prior, scale: Array) -> ExternalModel:
     )
 
 
-def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: Array) -> ExternalModel:
+def learn(arm: Arm, prior: ArmPrior, runs: Sequence[Samples], rate: float, scale: Array) -> ExternalModel:
     """From recordings without contact, of one rate [Hz]."""
     split, parts = gravity_split(arm), []
     for run in runs:
@@ -239,7 +241,7 @@ def learn(arm: Arm, prior: Prior, runs: Sequence[Samples], rate: float, scale: A
     )
 
 
-def joined(parts: Sequence[Rows]) -> Rows:
+def joined(parts: Sequence[TorqueRows]) -> TorqueRows:
     moves = [part.motion for part in parts]
     motion = RigidMotion(
         moves[0].gravity,
@@ -249,7 +251,7 @@ def joined(parts: Sequence[Rows]) -> Rows:
         np.concatenate([each.rate for each in moves]),
         np.concatenate([each.screw_rate for each in moves]),
     )
-    return Rows(
+    return TorqueRows(
         np.concatenate([part.left for part in parts]),
         np.concatenate([part.by_link for part in parts]),
         np.concatenate([part.by_joint for part in parts]),
@@ -258,14 +260,14 @@ def joined(parts: Sequence[Rows]) -> Rows:
     )
 
 
-def change_of(rows: Rows) -> Rows:
+def change_of(rows: TorqueRows) -> TorqueRows:
     """Rows less what they were before."""
     left, by_link, by_joint = (each - slow_mean(each) for each in (rows.left, rows.by_link, rows.by_joint))
-    return Rows(left, by_link, by_joint, rows.state, rows.motion)
+    return TorqueRows(left, by_link, by_joint, rows.state, rows.motion)
 
 
 def drift(left: Array) -> Array:
-    """What zeros have drifted by before each row (S, n), as far as the rows before show it."""
+    """Drift of the zeros before each row (S, n), as far as the rows before show it."""
     from scipy.signal import lfilter
 
     share = 1.0 / (DRIFT * ROWS_RATE)
@@ -299,7 +301,7 @@ def block_maxima(deviation: Array) -> Array:
     return np.asarray(deviation[: whole * size].reshape(whole, size).max(axis=1))
 
 
-def _folds(parts: Sequence[Rows]) -> NDArray[np.intp]:
+def _folds(parts: Sequence[TorqueRows]) -> NDArray[np.intp]:
     """Fold of each row: recordings, or stretches of them where there are few."""
     filled = [len(part) for part in parts if len(part)]
     if len(filled) >= FOLDS // 2:
@@ -308,7 +310,7 @@ def _folds(parts: Sequence[Rows]) -> NDArray[np.intp]:
     return np.asarray(np.arange(total) * FOLDS // max(total, 1), dtype=np.intp)
 
 
-def _prior_covariance(prior: Prior) -> Array:
+def _prior_covariance(prior: ArmPrior) -> Array:
     shared, own = prior.covariance, prior.joints_std.ravel() ** 2
     covariance = np.zeros((len(shared) + own.size,) * 2)
     covariance[: len(shared), : len(shared)] = shared
@@ -319,7 +321,7 @@ def _prior_covariance(prior: Prior) -> Array:
 class _Fit:
     """Normal equations by fold; each fold's rows are judged by a fit to the others."""
 
-    def __init__(self, prior: Prior, pieces: Sequence[Rows], folds: NDArray[np.intp]) -> None:
+    def __init__(self, prior: ArmPrior, pieces: Sequence[TorqueRows], folds: NDArray[np.intp]) -> None:
         self.prior, self.folds = prior, folds
         self.rows = joined(pieces)
         self.change = joined([change_of(piece) for piece in pieces])

@@ -28,9 +28,9 @@ acceleration [rad/s²]."""
 REMEMBERED = 0.15
 """Time constant with which a state is forgotten [s]: what the filter, and what gives way, still show of it."""
 THINNED = 50.0
-"""Rate at which derivatives pass the filter, or more [Hz]: twice the observer's bandwidth six times over."""
+"""Rate at which derivatives pass the filter, or more [Hz]: twelve times the observer's bandwidth."""
 WAVES = 24
-"""Functions of the pose that stand for what model and friction lack; a choice: more narrow no bound by a tenth."""
+"""Functions of the pose that stand for what model and friction lack; a choice."""
 WAVE_LENGTH = 1.0
 """Distance over which that is alike [rad], as in the observer's discrepancy."""
 JOINT_COLUMNS = (

@@ -32,8 +32,8 @@ from scipy.signal import lfilter
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.stated_model import StatedModel
-from calib.external.arm_model import ArmRecords, Listener, listener_of, prior_of
-from calib.external.listening import Frame, Heard, listen
+from calib.external.arm_model import ArmListener, ArmRecords, listener_of, prior_of
+from calib.external.listening import Heard, WrenchFrame, listen
 from calib.fit.creep_fit import fit_rows
 from calib.plan.creep_plan import plan_creep
 from calib.records.records import (
@@ -162,7 +162,7 @@ def judge(arm: Arm, seconds: float) -> Outcome:
     work = ordinary_motion(low, high, seconds, random)
     quiet = arm.recording(work)
     listener = listener_of(arm.records, [baseline], [quiet])
-    frame = Frame(kinematics.n - 1, np.array([0.0, 0.0, 0.1]))
+    frame = WrenchFrame(kinematics.n - 1, np.array([0.0, 0.0, 0.1]))
     heard = next(iter(listen(listener, quiet, frame, 1.0)))
     first = round(BEGINNING * ROWS_RATE)
     within = (np.abs(heard.judged.external) < 1.96 * heard.judged.std)[first:]
@@ -192,7 +192,7 @@ def judge(arm: Arm, seconds: float) -> Outcome:
     )  # fmt: skip
 
 
-def draw_pushes(arm: Arm, listener: Listener, work: Motion, heard: Heard, random) -> list[tuple[Push, float]]:
+def draw_pushes(arm: Arm, listener: ArmListener, work: Motion, heard: Heard, random) -> list[tuple[Push, float]]:
     """Pushes at 1.5 times the told smallest force, and that force."""
     detector, n = ContactDetector(listener.model, 1.0), arm.records.stated.arm.n
     motion = rows_of(listener, work)
@@ -217,7 +217,7 @@ def draw_pushes(arm: Arm, listener: Listener, work: Motion, heard: Heard, random
     return out
 
 
-def rows_of(listener: Listener, work: Motion):
+def rows_of(listener: ArmListener, work: Motion):
     from gcomp.external.external_model import stride_of
     from gcomp.external.rigid_motion import rigid_motion
 
@@ -364,8 +364,8 @@ def failed(name: str, outcomes: list[Outcome]) -> list[str]:
     )
     hours = sum(o.hours for o in outcomes)
     wrong += [f"{name}: {false} false alarms in {hours:.1f} h"] * (false > max(1.0, hours))
-    wrong += [f"{name}: {found} of {pushed} pushes found"] * (found < FOUND * pushed)
-    wrong += [f"{name}: {right} of {found} on the right link"] * (right < RIGHT_LINK * found)
+    wrong += [f"{name}: {found} of {pushed} pushes found"] * bool(found < FOUND * pushed)
+    wrong += [f"{name}: {right} of {found} on the right link"] * bool(right < RIGHT_LINK * found)
     wrong += [f"{name}: {contacts} loads called contact"] * (contacts > 0)
     for other in ("nominal", "calibrated"):
         ratio = float(np.median([o.needed["ours"] / o.needed[other] for o in outcomes]))

@@ -25,6 +25,14 @@ MODEL = f"""<mujoco><worldbody>{LINK.format(0, "j1", 0.5, 2)}{LINK.format(0.4, "
 SECONDS = 40.0
 
 
+def friction_side(q: np.ndarray) -> np.ndarray:
+    """Direction of friction, which turns round over 10 mrad."""
+    side = np.zeros_like(q)
+    for row in range(1, len(q)):
+        side[row] = np.clip(side[row - 1] + (q[row] - q[row - 1]) / 0.005, -1.0, 1.0)
+    return side
+
+
 def recording(model: Path, seed: int, push: float = 0.0) -> Recording:
     """Of swinging joints with friction; a push on the second joint from 20 to 21 s."""
     random, t = np.random.default_rng(seed), np.arange(0.0, SECONDS, 0.02)
@@ -34,7 +42,7 @@ def recording(model: Path, seed: int, push: float = 0.0) -> Recording:
     q, v, a = 0.6 * np.sin(angle), 0.6 * pace * np.cos(angle), -0.6 * pace**2 * np.sin(angle)
     q, v, a = (each.sum(axis=1) for each in (q, v, a))
     torque = inertial_torque(placed, q, v, a) + gravity_torque(placed.arm.arm, placed.arm.beta, q)
-    torque += 0.4 * np.tanh(v / 0.01) + 0.02 * random.normal(size=q.shape)
+    torque += 0.4 * friction_side(q) + 0.02 * random.normal(size=q.shape)
     torque -= np.outer((t >= 20.0) & (t < 21.0), [0.0, push, 0.0])
     return Recording(t=t, position=q, velocity=v, motor_torque=torque)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gcomp.arm.load import PlacedChain, bar_inertials, inertial_torque, place_chain
-from gcomp.external.external_model import ExternalModel, Prior, learn
+from gcomp.external.external_model import ArmPrior, ExternalModel, learn
 from gcomp.external.filtered_rows import JOINT_COLUMNS, WAVES, Samples
 from gcomp.gravity.torque import gravity_torque
 
@@ -62,15 +62,15 @@ class Work:
 
 
 @pytest.fixture(scope="session")
-def prior(placed: PlacedChain) -> Prior:
+def prior(placed: PlacedChain) -> ArmPrior:
     """The right links with some doubt, and nothing known of friction."""
     n, links = placed.arm.arm.n, bar_inertials(placed)
     std = np.zeros(len(JOINT_COLUMNS) + WAVES)
     std[: len(JOINT_COLUMNS)] = 0.3
     std[len(JOINT_COLUMNS) :] = 0.05
-    return Prior(links, 1e-4 * np.eye(10 * n), np.zeros((n, len(std))), np.tile(std, (n, 1)), np.full(n, 0.1))
+    return ArmPrior(links, 1e-4 * np.eye(10 * n), np.zeros((n, len(std))), np.tile(std, (n, 1)), np.full(n, 0.1))
 
 
 @pytest.fixture(scope="session")
-def learned(placed: PlacedChain, prior: Prior) -> ExternalModel:
+def learned(placed: PlacedChain, prior: ArmPrior) -> ExternalModel:
     return learn(placed.arm.arm, prior, [Work(placed, 1, 90.0).samples()], RATE, np.full(placed.arm.arm.n, 10.0))
