@@ -98,13 +98,14 @@ def share_lines(currents: bool = False) -> None:
     kind: Any = serial.Serial
     if hasattr(kind, "armlink_copies"):
         return
-    read, write, copies = kind.read, kind.write, dict[int, LineCopy]()
+    read, write, copies = kind.read, kind.write, dict[str, LineCopy]()
     kind.armlink_copies = copies
 
     def copy_of(port: Any) -> LineCopy:
-        found = copies.get(id(port))
+        name = str(port.port)
+        found = copies.get(name)
         if found is None:
-            found = copies[id(port)] = LineCopy(str(port.port))
+            found = copies[name] = LineCopy(name)
         return found
 
     def read_and_copy(self: Any, size: int = 1) -> Any:

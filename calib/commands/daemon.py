@@ -72,7 +72,10 @@ def daemon(
     require_extra("daemon", "daemon")  # they are imported later
     described = load_arm(arm)
     bus = stated_bus(bus, ros2, lerobot)
-    listen_only = listen_only or is_listening(resolve_bus(bus, described.require_link().bus))
+    opened = resolve_bus(bus, described.require_link().bus)
+    listen_only = listen_only or is_listening(opened)
+    if opened.interface == "ros2":
+        require_extra("daemon --ros2", "ros2")
     directory = state_directory(state, described)
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o750)

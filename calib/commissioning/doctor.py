@@ -9,7 +9,8 @@ from typing import get_args
 
 from armlink.arm_file import SIMULATED, ArmFile, BadKeys, Bus, bundled_arms, load_arm
 from armlink.bus.can_bus import CanBus
-from armlink.bus.open import open_link_bus, resolve_bus
+from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
+from armlink.bus.open import is_listening, open_link_bus, resolve_bus
 from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
 from armlink.link.bus_load import HIGH_LOAD, bus_loads
@@ -34,6 +35,10 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
     yield from _load(arm_file)
     bus = link.bus if spec is None else resolve_bus(spec, link.bus)
     name = f"{bus.interface}:{bus.channel}"
+    if is_listening(bus):
+        look = f"see whether readings come: armlink monitor {arm_file.argument} --once"
+        yield SetupFinding("hint", "armlink only listens to this arm, so its drives were not asked", name, look)
+        return
     absent = _absent_interface(bus) if not link.buses or spec is not None else None
     if absent is not None:
         yield absent
@@ -99,7 +104,11 @@ def silence_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         return
     link = arm_file.require_link()
     joints = zip(link.joints, traits_of(groups), strict=True)
-    found = [joint.name for joint, traits in joints if traits.reaction(link.keeper) == "keeps on"]
+    found = [
+        joint.name
+        for joint, traits in joints
+        if traits.reaction(link.keeper) == "keeps on" and joint.settings.family != JOINT_STATE_FAMILY
+    ]
     if found:
         yield SetupFinding(
             "warning",

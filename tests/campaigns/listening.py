@@ -13,6 +13,7 @@ another than the program writes in the domain or on the servo line, or if a chan
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -101,7 +102,7 @@ class Passes:
 
     def __init__(self, rate: float, seconds: float) -> None:
         self._period, self._seconds = 1 / rate, seconds
-        self.late, self.took = list[float](), list[float]()
+        self.late, self.took, self.cpu = list[float](), list[float](), list[float]()
 
     def __iter__(self) -> Any:
         due = time.perf_counter()
@@ -109,14 +110,16 @@ class Passes:
         while due < end:
             due += self._period
             time.sleep(max(due - time.perf_counter(), 0.0))
-            began = time.perf_counter()
+            began, cpu = time.perf_counter(), time.thread_time()
             yield
+            self.cpu.append(time.thread_time() - cpu)
             self.late.append(began - due)
             self.took.append(time.perf_counter() - began)
             due = max(due, time.perf_counter() - self._period)
 
     def told(self, **more: Any) -> str:
-        return json.dumps({"late_ms": 1e3 * np.median(self.late), "took_ms": 1e3 * np.median(self.took), **more})
+        columns = {"late_ms": self.late, "took_ms": self.took, "cpu_ms": self.cpu}
+        return json.dumps({name: 1e3 * float(np.median(values)) for name, values in columns.items()} | more)
 
 
 def publish(run: str, seconds: float) -> None:
@@ -181,34 +184,28 @@ def teleoperate(port: str, seconds: float) -> None:
 
 
 class ServoArm(ServoBench):
-    """The simulated arm as servos: led to their goals, their registers as its readings are."""
+    """The simulated arm at work as servos: their registers are its readings at the time of the request.
 
-    def __init__(self, run: str) -> None:
-        super().__init__(list(range(1, len(SERVOS) + 1)), dynamixel=False, before_answer=self._live)
-        self._hosted, self._began = HostedArm(run), time.monotonic()
-        self._cycles = 0
-        for servo, position in enumerate(self._hosted.sample.position, 1):
-            self._put(servo, SERVO.target, position)
-        self._show()
+    It is simulated beforehand, so that the servos answer at once on a busy machine, too.
+    """
 
-    def _live(self) -> None:
-        """Let the arm live until now, at its goals."""
-        due = int((time.monotonic() - self._began) * HOST_HZ)
-        registers = [self.registers[servo] for servo in sorted(self.registers)]
-        address = SERVO.target.address
-        counts = np.array([int.from_bytes(each[address : address + 2], "little") for each in registers])
-        goal = SERVO.target.unit * (counts - SERVO.target.centre)
-        for _ in range(min(due - self._cycles, int(HOST_HZ))):
-            self._hosted.cycle(goal)
-        self._cycles = due
-        self._show()
+    def __init__(self, run: str, seconds: float) -> None:
+        super().__init__(list(range(1, len(SERVOS) + 1)), dynamixel=False, before_answer=self._show)
+        hosted = HostedArm(run)
+        goals = hosted.goals(1 / HOST_HZ)
+        samples = [hosted.cycle(next(goals)) for _ in range(int(HOST_HZ * seconds))]
+        self._values = np.array([(each.position, each.velocity, each.motor_torque) for each in samples])
+        self._began = math.nan
 
     def _show(self) -> None:
-        sample = self._hosted.sample
-        for servo, row in enumerate(zip(sample.position, sample.velocity, sample.motor_torque, strict=True), 1):
-            for register, value in zip((SERVO.position, SERVO.velocity), row[:2], strict=True):
+        now = time.monotonic()
+        self._began = now if math.isnan(self._began) else self._began
+        place = min((now - self._began) * HOST_HZ, len(self._values) - 1.001)
+        before, share = int(place), place % 1
+        position, velocity, torque = (1 - share) * self._values[before] + share * self._values[before + 1]
+        for servo, row in enumerate(zip(position, velocity, torque / TORQUE_CONSTANT, strict=True), 1):
+            for register, value in zip((SERVO.position, SERVO.velocity, SERVO.current), row, strict=True):
                 self._put(servo, register, value)
-            self._put(servo, SERVO.current, row[2] / TORQUE_CONSTANT)
 
     def _put(self, servo: int, register: Any, value: float) -> None:
         count = round(value / register.unit) + register.centre
@@ -256,7 +253,7 @@ def run_of(kind: str, run: str, seconds: float, folder: Path) -> tuple[dict[str,
             told, _ = program.communicate()
             heard.wait() if heard else None
         return json.loads(told), others, recording
-    with ServoArm(run) as servos:
+    with ServoArm(run, seconds) as servos:
         arm = listeners_arm(kind, f"so101_follower:{servos.port}", folder)
         command = [str(Path(__file__)), "--program", servos.port, "--seconds", str(seconds)]
         tapped = [sys.executable, "-m", "armlink.lerobot", "--currents", *command]
@@ -327,8 +324,9 @@ def main() -> int:
             found, said = (True, "") if run == "alone" else diagnosed(kind, run, recording, folder)
             ok = later <= LATER_MS and others == 0 and found
             right = right and ok
+            late, took, cpu = (told[name] for name in ("late_ms", "took_ms", "cpu_ms"))
             print(
-                f"{kind} {run}: passes {told['late_ms']:.3f} ms late and {told['took_ms']:.3f} ms long (medians), "
+                f"{kind} {run}: passes {late:.3f} ms late and {took:.3f} ms long, {cpu:.3f} ms of the CPU (medians), "
                 f"{later:+.3f} ms with a listener; {others} writes of others; {said}{'' if ok else ' WRONG'}",
                 flush=True,
             )

@@ -165,6 +165,14 @@ def test_the_table_has_every_extra_of_the_project():
     assert REQUIREMENT.match('psycopg[binary]>=3.2; extra == "postgresql"')["extra"] == "postgresql"
 
 
+@pytest.mark.parametrize("words", [["monitor", "sarcos", "--once"], ["daemon", "sarcos", "--state", "state"]])
+def test_without_the_extra_a_ros_topic_cannot_be_heard(words, tmp_path):
+    lacking = run_without(["ros2"], DEMO.format(words=[*words, "--ros2", "/joint_states"]), tmp_path)
+    assert lacking.returncode == 2
+    (line,) = lacking.stderr.splitlines()
+    assert "cyclonedds (extra ros2) is not installed" in line
+
+
 DEMO = "from armlink import cli\nsys.exit(cli.run({words!r}))"
 
 

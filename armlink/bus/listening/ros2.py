@@ -43,16 +43,17 @@ class RosTopic:
         self._topic, self._domain = topic, _domain()
         quality = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(KEPT))
         try:
-            self._participant = DomainParticipant(self._domain)  # it ends with its last reference
-            named = Topic(self._participant, f"rt/{topic.lstrip('/')}", RosJointState, qos=quality)
-            self._reader = DataReader(self._participant, named, qos=quality)
+            participant = DomainParticipant(self._domain)
+            named = Topic(participant, f"rt/{topic.lstrip('/')}", RosJointState, qos=quality)
+            self._entities: list[Any] = [DataReader(participant, named, qos=quality), participant]
+            """The reader, and the participant that ends with its last reference; empty once closed."""
         except DDSException as error:
             raise BusFault(f"bus ros2:{topic}: cannot open it: {error}") from None
         self.lost = 0
 
     def take(self) -> list[JointStateMessage]:
         try:
-            samples = self._reader.take(KEPT)
+            samples = self._entities[0].take(KEPT) if self._entities else []
         except DDSException as error:
             raise BusFault(f"bus ros2:{self._topic}: cannot read it: {error}") from None
         now = time.monotonic()
@@ -67,7 +68,7 @@ class RosTopic:
         )
 
     def close(self) -> None:
-        del self._reader, self._participant
+        self._entities.clear()
 
 
 def _message(sample: Any, arrived: float) -> JointStateMessage:
