@@ -112,7 +112,7 @@ published: .venv/.dev ## Long campaign outside make test: published arm models t
 	test -d .published || $(BIN)/python -m pip install -q --no-deps --target .published example-robot-data rtb-data openarm-mujoco gym-aloha
 	$(BIN)/python tests/campaigns/published_models.py .published $(ARGS)
 
-elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simulates with its defaults (ARGS="--cases 24 --seed 1 --rate 30 --torques")
+elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simulates, with drawn models, rates and noise (ARGS="--cases 24 --seed 1 --rate 30 --torques --models FOLDER")
 	$(BIN)/python tests/campaigns/simulated_elsewhere.py $(ARGS)
 
 bodies: .venv/.dev ## Long campaign outside make test: turned bases, bodies added and missing (ARGS="--tilts 40 --bodies 40")

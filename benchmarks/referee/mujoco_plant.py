@@ -119,7 +119,9 @@ def apply(spec: Any, effect: str, joint: int, random: np.random.Generator) -> No
 
 def record(drawn: Drawn, spec: Any, random: np.random.Generator, reaching: bool, torques: bool) -> Any:
     every = TORQUE_EVERY if torques else POSITION_EVERY
-    return elsewhere.recorded(spec, drawn.arm, random, every, reaching, torques, SECONDS)
+    given = elsewhere.commands(drawn.arm, round(SECONDS / elsewhere.STEP_S), random, reaching)
+    noise = elsewhere.NOISE_RAD[0]
+    return elsewhere.recorded(spec, drawn.arm, given, every * elsewhere.STEP_S, random, noise, torques)
 
 
 def totals(spec: Any, torques: bool) -> dict[str, list[float]]:

@@ -4,7 +4,7 @@ A row far off, as of a moment of contact, then counts little, with no threshold.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from gcomp.estimate.problem import EstimationProblem, Linearised, linearise
 
 STILL = 1e-3
 """Relative fall of a channel's cost below which its fit ends."""
+SHORT_OF = 0.5
+"""Share of the fall that derivatives promise, below which they are taken afresh."""
 LONGEST_STEP = 1.5
 """Longest step of a parameter, in its own coordinate."""
 SHORTENED = 6
@@ -59,7 +61,8 @@ def cost_of(problem: EstimationProblem, residual: Array, variance: Array) -> Arr
 
 
 def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterations: int = 6) -> RobustFit:
-    """The most probable values of the free parameters from `theta` (K,) on.
+    """The most probable values of the free parameters from `theta` (K,) on, in at most so many steps with derivatives
+    by differences, and twice as many in all: the others are with those that followed from the steps before.
 
     Where no parameter acts on all channels, each channel takes its own steps.
     """
@@ -69,17 +72,24 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
     damping, busy = np.full(channels, 1e-3), np.ones(channels, bool)
     theta = problem.within(np.array(theta, float))
     now: Array | None = None  # residual at theta, where it is known
-    for _ in range(iterations):
+    about: Linearised | None = None
+    for _ in range(2 * iterations):
         moving = [k for k in free if shared or busy[problem.parameters[k].channel]]
         if not moving:
             break
-        about = linearise(problem, theta, moving, now)
+        if fresh := about is None:
+            if not iterations:
+                break
+            iterations -= 1
+            about = linearise(problem, theta, moving, now)
         now = about.residual
-        variance = scale_of(problem, about.residual)
-        before = cost_of(problem, about.residual, variance) + prior_cost(problem, theta, channels)
-        weight = problem.weight * robust_weight(about.residual, variance, problem.freedom) / variance[:, None]
-        for _ in range(SHORTENED):
-            trial = problem.within(theta + _step(problem, about, weight, damping))
+        variance = scale_of(problem, now)
+        before = cost_of(problem, now, variance) + prior_cost(problem, theta, channels)
+        weight = problem.weight * robust_weight(now, variance, problem.freedom) / variance[:, None]
+        for _ in range(SHORTENED if fresh else 1):
+            step = np.zeros(len(theta))
+            step[moving] = _step(problem, about, weight, damping)[moving]
+            trial = problem.within(theta + step)
             left = problem.predict(trial[None])[0]
             after = cost_of(problem, left, variance) + prior_cost(problem, trial, channels)
             lower = after < before if not shared else np.full(channels, after.sum() < before.sum())
@@ -87,16 +97,41 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
             if lower[busy].any():
                 break
         fall = before - after
+        promised = before - cost_of(problem, _expected(about, trial), variance) - prior_cost(problem, trial, channels)
+        about = _with_secant(about, weight, trial, left)
         if lower.any():
             taken = [k for k in moving if lower[max(problem.parameters[k].channel, 0)]]
             theta[taken] = trial[taken]
-            now = left if np.array_equal(theta, trial) else None
-        still = ~lower | (fall < STILL * np.maximum(problem.weight.sum(1), 1.0))
-        busy = np.full(channels, not still.all()) if shared else busy & ~(still & lower) & ~(~lower & (damping > 1e3))
-        if not lower.any():
+            now = left if np.array_equal(theta, trial) else problem.predict(theta[None])[0]
+            about = replace(about, theta=theta.copy(), residual=now)
+        small = STILL * np.maximum(problem.weight.sum(1), 1.0)
+        done = (fall < small) & (lower if fresh else lower & (promised < small)) | (damping > 1e3)
+        busy = np.full(channels, not done.all()) if shared else busy & ~done
+        if fresh and not lower.any():
             break
+        serve = fall[busy].sum() >= SHORT_OF * promised[busy].sum()
+        about = about if serve else None
     residual = problem.predict(theta[None])[0] if now is None else now
     return RobustFit(theta, residual, scale_of(problem, residual))
+
+
+def _expected(about: Linearised, trial: Array) -> Array:
+    """Residual at `trial` (K,) as the derivatives have it, (C, N)."""
+    out = about.residual.copy()
+    for c, (index, x) in enumerate(zip(about.acting, about.slopes, strict=True)):
+        out[c] += (trial - about.theta)[index] @ x
+    return out
+
+
+def _with_secant(about: Linearised, weight: Array, trial: Array, left: Array) -> Linearised:
+    """Derivatives that also lead to what was found at `trial`, the least changed (Broyden, Math. Comp. 19, 1965)."""
+    missed, slopes = left - _expected(about, trial), []
+    for c, (index, x) in enumerate(zip(about.acting, about.slopes, strict=True)):
+        step = (trial - about.theta)[index]
+        along = step * ((x**2) @ weight[c])
+        length = float(along @ step)
+        slopes.append(x + np.outer(along / length, missed[c]) if length > 0.0 else x)
+    return replace(about, slopes=tuple(slopes))
 
 
 def prior_cost(problem: EstimationProblem, theta: Array, channels: int) -> Array:

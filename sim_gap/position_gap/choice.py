@@ -170,8 +170,8 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
 
-def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> tuple[LoopFit, About]:
-    """Choose effects about the fit and fit them, until the choice stays; the best fit, and what was looked at last.
+def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
+    """Choose effects about the fit and fit them, until the choice stays; the best fit.
 
     After the first time only those are looked at that were worth their price by themselves or are there.
     """
@@ -206,8 +206,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         made = search.improve(about.moved(found), 4)
         if worth(search, made) >= most:
             fit = made
-    # all candidates once more: what the start has explained already may have rivals that were not looked at
-    return fit, look_about(search, fit, levels=levels)
+    return fit
 
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:

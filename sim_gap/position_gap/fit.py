@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,13 +174,21 @@ class Layout:
         data, shape = self.search.data, (self.joints, -1)
         parameters = tuple(self._parameter(j, name, (steps or {}).get((j, name))) for j, name in self.places)
 
-        def predict(thetas: Array) -> Array:
+        def predicted(data: Windows, thetas: Array) -> Array:
             left = residuals(data, [self.at(theta) for theta in thetas])
             return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
 
         weight = data.weight.transpose(1, 0, 2).reshape(shape) * min(data.judged_s / INDEPENDENT_S, 1.0)
         block = np.broadcast_to(np.arange(data.count), (len(data.measured), data.count)).ravel()
-        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), self.search.floor)
+        coarse = replace(data, plant=data.plant.coarser)
+        return EstimationProblem(
+            parameters,
+            partial(predicted, data),
+            weight,
+            block.astype(np.intp),
+            self.search.floor,
+            cheaper=partial(predicted, coarse),
+        )
 
     def _parameter(self, j: int, name: str, step: float | None) -> FittedParameter:
         if j < 0:

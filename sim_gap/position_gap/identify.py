@@ -26,7 +26,7 @@ from sim_gap.position_gap.judge import Stage, stages
 from sim_gap.position_gap.parameters import shared_effects
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
-from sim_gap.position_gap.start import limited_servo_starts, noise_floor, scales_of, starting_fit
+from sim_gap.position_gap.start import limited_servo_start, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
 from sim_gap.position_gap.training.replay import nominal, replay_rms
@@ -169,17 +169,16 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
         bare = LoopFit(search.nominal)
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, progress)
-    best, about = select(search, fit, progress)
+    best = select(search, fit, progress)
     left = rms_on(search.data, best.point)
     unexplained = left > np.maximum(EXPLAINED * before, QUIET * search.floor)
     unexplained &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
     if complete and unexplained.any():
         progress("fitting servos with limits as a start")
-        starts = limited_servo_starts(search, best, unexplained)
-        other, beside = select(search, max(starts, key=lambda each: worth(search, each)), progress)
-        if worth(search, other) > worth(search, best):
-            return search, other, beside
-    return search, best, about
+        other = select(search, limited_servo_start(search, best, unexplained), progress)
+        best = max(best, other, key=lambda each: worth(search, each))
+    # all candidates: what the start has explained already may have rivals that were not looked at
+    return search, best, look_about(search, best)
 
 
 def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ LOCKED_TOLERANCE = 1e-16
 the arm of two joints in `tests/sim_gap/position_gap/test_plant.py` rests 4 mrad off, with this 0.3 µrad."""
 Point = Mapping[str, Array]
 """Parameter → (J,); one of the whole arm has the same value at each joint."""
+COARSER = 2.0
+"""Time step of a simulation for derivatives, over the model's."""
 SPEED_S = 0.01
 """Time over which the derivative of a command is taken [s]."""
 
@@ -177,11 +180,13 @@ def held_parts(sim: SimModel) -> list[str]:
 class MovedModel:
     """The model with parameters of joints, servos and links to be changed."""
 
-    def __init__(self, sim: SimModel) -> None:
+    def __init__(self, sim: SimModel, steps: float = 1.0) -> None:
+        """`steps` is the time step over that of the model."""
         import mujoco
 
         self.sim, (self.actuator, self.servo) = sim, servos_of(sim)
         self.model = held_model(sim)
+        self.model.opt.timestep *= steps
         joints = list(sim.joints)
         self.joints, self.n, self.dt = joints, sim.n, float(self.model.opt.timestep)
         self.dofs, self.places = self.model.jnt_dofadr[joints], self.model.jnt_qposadr[joints]
@@ -201,6 +206,11 @@ class MovedModel:
         """Share of gravity that the model compensates, where it is the same for all bodies of the arm."""
         self.state = mujoco.MjData(self.model)
         self._states: list[Any] = []
+
+    @cached_property
+    def coarser(self) -> "MovedModel":
+        """The same with a longer time step, for derivatives."""
+        return MovedModel(self.sim, COARSER)
 
     def states(self, count: int) -> list[Any]:
         """States to be stepped together; the same ones at each call."""

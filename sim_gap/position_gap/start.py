@@ -9,7 +9,7 @@ from scipy.stats import qmc
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, Progress, costs_of
+from sim_gap.position_gap.choice import FEW, Progress, costs_of, worth
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.windows import Windows, thin
@@ -108,8 +108,8 @@ def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, Lo
     return search, fit
 
 
-def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[LoopFit]:
-    """Fits that begin at the best of drawn servos with limits at the joints `where` (J,), and at `fit` elsewhere.
+def limited_servo_start(search: LoopSearch, fit: LoopFit, where: Mask) -> LoopFit:
+    """The best of fits that begin at drawn servos with limits at the joints `where` (J,), and at `fit` elsewhere.
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
@@ -120,8 +120,8 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
-        starts.append(few.improve(LoopFit(point).freed(free), 5))
-    return starts
+        starts.append(few.improve(LoopFit(point).freed(free), 2))
+    return few.improve(max(starts, key=lambda each: worth(few, each)), 5)
 
 
 def _drawn_servos(search: LoopSearch, fit: LoopFit, where: Mask) -> list[dict[str, Array]]:

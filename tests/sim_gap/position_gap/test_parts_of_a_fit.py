@@ -197,7 +197,7 @@ def test_what_differs_alone_is_chosen_alone(change, effects: set[fitting.Group])
     real = change(TEXT)
     search = search_on(TEXT, [record(real, seed, 14.0) for seed in (1, 2)])
     search = replace(search, excluded=frozenset({"actuator.back_emf"}))  # no servo is ever off
-    fit, _ = select(search, LoopFit(search.nominal))
+    fit = select(search, LoopFit(search.nominal))
     assert (rms_on(search.data, fit.point) < 1.5e-3).all()
     assert len(edits.chosen_of(search, fit)) == 1
     assert effects >= {*edits.chosen_of(search, fit)}
