@@ -28,8 +28,7 @@ MOST_CANDIDATES = 8
 ORDER_ROWS = 30
 """Rows on which orders are compared."""
 DISTINCT_FALL = 3.0 * PRICE
-"""Difference of the negative log likelihoods from which one correction is likelier than another: errors of
-sound models alone make one order of two wrist joints likelier by some prices."""
+"""Fall from which one correction is likelier than another: errors of sound models alone make a wrong order cheaper."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
 

@@ -95,8 +95,9 @@ IDLE_COST = 4.0 * PRICE
 """Negative log likelihood of a motor that is idle, or of a dead sensor: the price of an effect that few arms have."""
 RANGE_COST = 5.0 * PRICE
 """Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
-JOINT_EFFECTS, FRICTION_EFFECTS = 6, 3
-"""Effects of a joint that act on it alone; those of them that are friction and a rotor."""
+JOINT_EFFECTS, FRICTION_EFFECTS, CARRIED = 6, 3, (0, 2)
+"""Effects of a joint that act on it alone; those of them that are friction and a rotor; places of those in which the
+pose shows, which an idle motor or a dead sensor has not: the model's torque and a spring."""
 BOUND_WEIGHT = 1e12
 """Weight of a coefficient that is held at a bound."""
 ROWS_AT_ONCE = 60_000
@@ -163,7 +164,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
     turn[..., JOINT_EFFECTS, 0] = _model_size(model)
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
-    without[..., 0, :], without[..., :, 0] = 0.0, 0.0
+    without[..., CARRIED, :], without[..., :, CARRIED] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
     whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
@@ -235,9 +236,10 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     costs = _fit(motion, left, own, spread, limits, shared)
     idle = motion.idle & (reading.std(0) < model.std(0))
     if idle.any():
-        free = np.full_like(spread[:, 1:], -np.inf), np.full_like(spread[:, 1:], np.inf)
+        kept = np.setdiff1d(np.arange(JOINT_EFFECTS), CARRIED)
+        free = np.full_like(spread[:, kept], -np.inf), np.full_like(spread[:, kept], np.inf)
         none = np.zeros((0, *left.shape)), np.zeros(0), np.zeros((2, 0))
-        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + IDLE_COST / FOLDS
+        without = _fit(motion, reading.T, own[:, kept], spread[:, kept], free, none) + IDLE_COST / FOLDS
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))

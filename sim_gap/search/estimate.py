@@ -130,12 +130,10 @@ class EffectEstimate:
         many degrees of freedom as there are recordings less one; the sum has those of Satterthwaite (Biometrics
         Bulletin 2, 1946), and Student's factor for them is in this one.
         """
-        data = self.store.data
-        lasts = np.cumsum(data.lengths) - 1
-        count = len(lasts)
-        if count < 2:
+        blocks, ends = self.store.data.blocks, np.cumsum(self.store.data.lengths)
+        if (count := len(ends)) < 2:
             return np.ones(len(whole))
-        of_recordings = np.add.reduceat(scores, [0, *(data.blocks[lasts[:-1]] + 1).tolist()], axis=0)
+        of_recordings = np.add.reduceat(scores, [0, *(blocks[ends[:-1] - 1] + 1).tolist()], axis=0)
         own = np.maximum(np.diag(whole), 1e-300)
         both = (np.diag(_sandwich(inverse, each)) for each in (of_recordings, scores))
         excess = np.maximum(np.subtract(*both), 0.0)
