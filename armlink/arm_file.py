@@ -208,6 +208,9 @@ class LinkSection(Section):
     joints: tuple[LinkJoint, ...]
     park: Park | None = None
     """Pose in which the arm is stowed; None: it is left where it stands."""
+    keeper: bool = False
+    """Drives that keep on with their last command are driven, with a process of their own that stops them when the host
+    dies: it cannot stop them where the machine dies, or their cable."""
 
     @property
     def rated_torques(self) -> Array:

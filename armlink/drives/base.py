@@ -215,6 +215,11 @@ class BasicDrives(Generic[M]):
         they leave. None where they carry no target (they switch it, ask it, stop it)."""
         return self.memory[joint].sent
 
+    def safe_frames(self, joint: int) -> Sequence[Frame]:
+        """Frames after which a drive stays as its trait `kept` says, whatever its host did last and although none comes
+        any more; by the newest readings and order, within `Limits`. Empty for a drive without power."""
+        return ()
+
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """Decode a frame of a drive; None if it tells nothing, or is not as it should be (any bytes may come)."""
         raise NotImplementedError

@@ -13,7 +13,7 @@ from armlink.arm_file import LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import BROADCAST, BasicDrives, DriveMemory, no_order
 from armlink.drives.mit_packing import Grid, MitCommand, Special, pack_steps, special_of, unpack_command
-from armlink.drives.orders import Gains, Limits, Mode, Order, Power, ReadingRange, Setup
+from armlink.drives.orders import Gains, Limits, Mode, Order, Power, ReadingRange, Setup, law_torque
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
@@ -109,6 +109,21 @@ class MitDrives(BasicDrives[K]):
         most = self.limits_of(joint).max_torque
         command = damping(self.settings[joint].kd, known.position, known.velocity, most)
         return self._sent(joint, grid, grid.steps(command), Power.STOPPED)
+
+    def safe_frames(self, joint: int) -> Sequence[Frame]:
+        """It holds where it stands, with the torque that the newest order came to there; it damps where it damped."""
+        known, settings = self.memory[joint], self.settings[joint]
+        if known.sent is None:
+            return ()
+        limits, grid, position, velocity = self.limits_of(joint), self.grid_of(joint), known.position, known.velocity
+        if known.damping or not math.isfinite(position):
+            steps = grid.steps(damping(settings.kd, position, velocity, limits.max_torque))
+        else:
+            torque = law_torque(known.sent, position, velocity if math.isfinite(velocity) else 0.0)
+            target = max(limits.lower, min(limits.upper, position))
+            held = MitCommand(target, 0.0, settings.kp, settings.kd, torque)
+            steps = round_within(held, grid, limits, position, velocity)
+        return (self.coded(joint, steps),)
 
     def _sent(self, joint: int, grid: Grid, steps: Steps, power: Power) -> Frame:
         frame = self.coded(joint, steps)

@@ -68,10 +68,10 @@ class MitFeedback(NamedTuple):
 class PackedField:
     """One packed number: of b bits, 2^b − 1 steps from its lowest to its highest value."""
 
-    __slots__ = ("least", "most", "span")
+    __slots__ = ("largest", "least", "most", "span")
 
     def __init__(self, least: float, largest: float, bits: int) -> None:
-        self.least, self.span, self.most = least, largest - least, float((1 << bits) - 1)
+        self.least, self.largest, self.span, self.most = least, largest, largest - least, float((1 << bits) - 1)
 
     def value(self, steps: int) -> float:
         return steps * self.span / self.most + self.least

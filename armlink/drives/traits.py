@@ -27,9 +27,15 @@ class Traits:
     """Identifiers of 11 or 29 bits on classical CAN, or CAN FD."""
     torque_cycles: int = 1
     """Cycles from one torque reading to the next."""
+    kept: Silence | None = None
+    """Of a drive that keeps on: what it does once a keeper (`armlink.link.keeper`) has sent its `safe_frames`."""
+
+    def reaction(self, keeper: bool) -> Silence:
+        """What it does when its host falls silent, with a keeper or without."""
+        return self.kept if keeper and self.kept and self.silence == "keeps on" else self.silence
 
     def as_json(self) -> dict[str, Any]:
         """By name, as `armlink drives --json` has them."""
         shown = {**asdict(self), "bounds": list(self.bounds)}
-        del shown["torque_cycles"]
+        del shown["torque_cycles"], shown["kept"]
         return shown

@@ -14,11 +14,13 @@ from armlink.bus.port import BUS_SHIFT, Frame, Port
 from armlink.clock import Clock
 from armlink.drives.base import ANY
 from armlink.drives.board import Board, DriveEvent
-from armlink.drives.orders import Order, Reading, power_code
-from armlink.errors import BusFault, HostLate
+from armlink.drives.orders import Order, Power, Reading, law_torque, power_code
+from armlink.errors import BusFault, HostLate, Refused
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
+from armlink.link.gate import EXACT
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
+from armlink.link.keeper import Keeper
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -81,6 +83,8 @@ class Loop:
             self._route(group)
         self.told: list[Order | None] = [None] * self.n
         """Orders of the newest frames by their bytes, at each joint; None where they carry no target."""
+        self.keeper: Keeper | None = None
+        """Told in every cycle what leaves the drives safe, should this be the last."""
         self._leaving: list[Frame] = []
         """Frames of the newest cycle, which have passed the check."""
         self._counted = self._dropped = 0
@@ -228,6 +232,8 @@ class Loop:
             raise HostLate(now - decided, max_age, "the command became too old before its frames were sent")
         if self._first is None:
             self._first = now
+        if self.keeper is not None:
+            self.keeper.renew(self._safe_frames())
         board.awaited = self._expected
         self.watch.syncs += 1
         self.stats.asked += 1
@@ -295,6 +301,24 @@ class Loop:
             self._leaving = frames
         return frames
 
+    def _safe_frames(self) -> list[Frame]:
+        """Of drives that keep on with their last command. Raises Refused where their bytes order more than a limit
+        of the drive, by its newest readings."""
+        found = list[Frame]()
+        for group in self.groups:
+            drives = group.drives
+            for joint in range(len(group.places)):
+                for can_id, data in drives.safe_frames(joint):
+                    for _, order in drives.commands_of(can_id, data):
+                        known, limits = drives.memory[joint], drives.limits_of(joint)
+                        torque = law_torque(order, known.position, known.velocity)
+                        inside = limits.lower <= order.position <= limits.upper or not order.kp > 0
+                        within = inside and abs(torque) <= EXACT * limits.max_torque
+                        if order.power is Power.ON and not within:
+                            raise Refused(f"keeper: the frame to {drives.where(joint)} is beyond a limit: not kept")
+                    found.append((can_id | group.tag, data))
+        return found
+
     def _timely(self) -> NDArray[np.bool_]:
         """Which readings are replies to this cycle's commands; replies that are owed for long are lost."""
         board = self.board
@@ -334,7 +358,7 @@ class Loop:
         if take is not None:
             take(can_id, data)
             return
-        if not self.watch.intruder:
+        if not self.watch.intruder and not (self.keeper is not None and self.keeper.sends((can_id, data))):
             self._suspect(can_id, data)
         self.watch.strangers += 1
         for take in self._any:

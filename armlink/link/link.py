@@ -29,9 +29,10 @@ from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges, requ
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
-from armlink.link.joints.groups import Group, by_joint, make_groups
+from armlink.link.joints.groups import Group, by_joint, make_groups, traits_of
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
+from armlink.link.keeper import Keeper
 from armlink.link.park import falling, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.termination import Presses, said
@@ -45,6 +46,9 @@ PATIENCE = 2.5
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Another host is listened for before anything is sent to the nodes: this many periods, and at least this long [s],
 since a host on a busy computer may pause for some 0.05 s."""
+BACKLOGS = 5
+"""So often all frames that are there are taken in before the start: drives that send by their own clock go on while a
+busy computer has not read them yet."""
 ANSWER_SECONDS = 5.0
 """After a stall a controller may take so long to answer [s]."""
 R = TypeVar("R")
@@ -59,11 +63,17 @@ class Link(Calibrations):
     """
 
     def __init__(
-        self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None, overloaded: str = ""
+        self,
+        arm: ArmFile,
+        bus: "CanBus | can.BusABC",
+        clock: Clock | None = None,
+        overloaded: str = "",
+        spec: str | None = None,
     ) -> None:
         """Take `bus` (python-can's too, closed on leaving) and a clock: by default the bus's own or the machine's.
 
-        `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`).
+        `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`). `spec` names
+        the bus for a keeper, which opens it too; None: the arm file's.
         """
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
@@ -92,7 +102,7 @@ class Link(Calibrations):
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self.last: Command | None = None
         self._hold: ArmHold | None = None
-        self._overloaded = overloaded
+        self._overloaded, self._spec = overloaded, spec
         self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
         """Told what start() does with an arm that is out."""
 
@@ -101,7 +111,7 @@ class Link(Calibrations):
         """Open the bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput or BusFault."""
         from armlink.bus.open import open_link_bus
 
-        return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus))
+        return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus), spec=bus)
 
     def __enter__(self) -> Self:
         return self
@@ -121,6 +131,8 @@ class Link(Calibrations):
                 with Presses() as presses:
                     end(self, cause, said(self.arm.name, presses, logging.INFO if self._lock_step else logging.WARNING))
         finally:
+            if self._loop.keeper is not None:
+                self._loop.keeper.close()
             self.bus.shutdown()
             if self._hold is not None:
                 self._hold.release()
@@ -227,7 +239,11 @@ class Link(Calibrations):
 
     def require_alone(self) -> None:
         """Listen before anything is set; raises BusFault where another host is on the bus."""
-        self._loop.drain()
+        for _ in range(BACKLOGS):
+            self._loop.watch.clear()
+            self._loop.drain()
+            if not self._loop.watch.flooded:
+                break
         self._loop.watch.clear()
         for group in self.groups:
             group.drives.forget(restarts=True)
@@ -320,6 +336,7 @@ class Link(Calibrations):
         """
         self._require_start()
         require_deadman(self)
+        self._start_keeper()
         self._forget()
         self.commander.settle()
         self.turns.require(positions_before_power(self.commander, self.set_up_positions.tolist(), self._since))
@@ -334,6 +351,17 @@ class Link(Calibrations):
         self._enabled, self._held = True, False
         self.last = Command.hold(np.array(self._loop.latest_position))
         return sample
+
+    def _start_keeper(self) -> None:
+        """Have a process watch this one, where drives would keep on with their last command; raises Refused.
+
+        A simulated arm inside this process ends with it.
+        """
+        loop = self._loop
+        if self._lock_step or not self.section.keeper or not any(each.kept for each in traits_of(self.groups)):
+            return
+        if loop.keeper is None or loop.keeper.lost:
+            loop.keeper = Keeper(self.section, self._spec)
 
     def recover(self) -> Sample:
         """After a Stall: bring drives back that left the communication, and enable every joint where it stands."""

@@ -63,13 +63,15 @@ def falling(link: Parked) -> list[str]:
 
 
 def require_deadman(link: Parked) -> None:
-    """Raise Refused where a drive keeps its last command when its host dies."""
+    """Raise Refused where a drive keeps its last command when its host dies, and no keeper stops it."""
     traits = traits_of(link.groups)
     for name, each in zip(link.names, traits, strict=True):
-        if each.silence == "keeps on":
+        if each.reaction(link.section.keeper) == "keeps on":
+            instead = ", or set `link.keeper: true` (docs/safety.md, keeper)" if each.kept else ""
             raise Refused(
                 f"{name}: if this host dies, its drive keeps on with the last command (`silence: keeps on`), so "
-                "this joint is not driven: choose a firmware or a setting with which the drive watches its host"
+                "this joint is not driven: choose a firmware or a setting with which the drive watches its "
+                f"host{instead}"
             )
 
 

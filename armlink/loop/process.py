@@ -341,7 +341,7 @@ class KeptLoop(DriveLoop):
             self._synced = listener.clock.now()
             self._up(Up(None, listener.uncalibrated))
             return
-        self.arm = link = Link(arm, bus, overloaded=overload(arm, self._opening.bus))
+        self.arm = link = Link(arm, bus, overloaded=overload(arm, self._opening.bus), spec=self._opening.bus)
         link.commander.loop.on_cycle = self._sign_of_life
         self._hold = self._hold or ArmHold(bus, link.addresses)  # for good: through a passing fault too
         link.start()

@@ -32,10 +32,10 @@ ASKED_CYCLES = 5
 
 def announcement(arm: ArmFile) -> str:
     """The test with power in sentences, for a person who is asked before it begins."""
-    groups, deadline = make_groups(arm), arm.require_link().deadline * 1e3
+    groups, deadline, keeper = make_groups(arm), arm.require_link().deadline * 1e3, arm.require_link().keeper
     traits, drives = traits_of(groups), dict[str, list[str]]()
     for name, (group, _), each in zip(arm.joint_names, by_joint(groups), traits, strict=True):
-        drives.setdefault(f"{each.silence} ({group.family.name})", []).append(name)
+        drives.setdefault(f"{each.reaction(keeper)} ({group.family.name})", []).append(name)
     steps = groups[0].family.self_test_steps.format(deadline=deadline) if len(groups) == 1 else ""
     if not steps:
         told = "; ".join(f"{', '.join(names)}: {drive}" for drive, names in drives.items())
@@ -176,7 +176,7 @@ class SelfTest:
     def _watched(self) -> str:
         """Why the joints are not driven: a drive that is known to keep on when its host falls silent; else empty."""
         pairs = zip(self.link.names, traits_of(self.link.groups), strict=True)
-        keeping = [name for name, traits in pairs if traits.silence == "keeps on"]
+        keeping = [name for name, each in pairs if each.reaction(self.link.section.keeper) == "keeps on"]
         for name in keeping:
             self.checks.add(name, "silence", "failed", KEEPS_ON)
         if not keeping:
@@ -199,8 +199,12 @@ class SelfTest:
             found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
             self.checks.add(name, "enables and holds", "passed", found, seconds)
         self._under_way = "silence"
+        kept = [joint for joint, each in enumerate(traits_of(link.groups)) if each.silence == "keeps on"]
         for joint in range(link.n):
-            self._silence(joint)
+            if joint not in kept:
+                self._silence(joint)
+        if kept:
+            self._keeper(kept)
         self._under_way = "park"
         return self._park()
 
@@ -255,6 +259,26 @@ class SelfTest:
             told += f": {KEEPS_ON}"
         good = does == trait or (does, trait) == ("holds", "damps")
         self.checks.judge(name, "silence", good, told, seconds)
+
+    def _keeper(self, kept: list[int]) -> None:
+        """No command for any joint: does the keeper hold those whose drives would keep on with their last one?"""
+        link, loop = self.link, self.link.commander.loop
+        seconds, left = PATIENCE * link.section.deadline, "; a dead machine or a pulled cable leaves the last command"
+        if loop.keeper is None:
+            for joint in kept:
+                told = f"its drive keeps on with its last command, and no keeper is needed in a simulation{left}"
+                self.checks.add(link.names[joint], "silence", "absent", told)
+            return
+        self.progress(f"no commands for {seconds * 1e3:.0f} ms: the keeper holds the joints")
+        standing, loop.keeper.heard = np.array(loop.latest_position), False
+        loop.listen(seconds)
+        moved = np.abs(np.array(loop.latest_position) - standing)
+        for joint in kept:
+            heard = "sent its frames" if loop.keeper.heard else "was not heard"
+            told = f"its keeper {heard} within {seconds * 1e3:.0f} ms, and it moved by {moved[joint]:.4f} rad{left}"
+            self.checks.judge(link.names[joint], "silence", loop.keeper.heard and bool(moved[joint] < HELD), told)
+        link.commander.settle()
+        link.commander.walk(Power.ON)
 
     def _lean(self, joint: int) -> None:
         """Lead a joint away from where it hangs, towards the middle of its way."""

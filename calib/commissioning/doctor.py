@@ -97,15 +97,16 @@ def silence_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         groups = make_groups(arm_file)
     except ArmlinkError:  # as above
         return
-    joints = zip(arm_file.require_link().joints, traits_of(groups), strict=True)
-    found = [joint.name for joint, traits in joints if traits.silence == "keeps on"]
+    link = arm_file.require_link()
+    joints = zip(link.joints, traits_of(groups), strict=True)
+    found = [joint.name for joint, traits in joints if traits.reaction(link.keeper) == "keeps on"]
     if found:
         yield SetupFinding(
             "warning",
             f"if the host dies, the drives of these joints keep on with their last command: {', '.join(found)}",
             f"{arm_file.path}: link.joints",
             "armlink reads them and gives them no power: state the time-out that is set in them, where they have one "
-            "(docs/drive-families.md)",
+            "(docs/drive-families.md), else set `link.keeper: true` (docs/safety.md)",
         )
 
 

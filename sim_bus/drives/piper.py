@@ -22,6 +22,7 @@ STOP_DAMPING = 0.5
 NEWTON_METERS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
 """By the ampere, as the SDK converts currents."""
 MIT, MOVE_M, TARGETS = 0xAD, 4, 1
+MOST_COUNTS = 0x7FFFFFFF
 ENCODER = 0x20
 """Bit of a joint's state: its drive has an error."""
 
@@ -118,13 +119,15 @@ class PiperJoint(SimulatedDrive):
                 0x2A1, struct.pack(">6BH", int(self.mode != 0), stopped, MOVE_M * (self.mode == MIT), 0, 0, 0, 0)
             )
         first = self.number - (self.number - 1) % 2
-        if self.number == max(each for each in (first, first + 1) if each in self.arm):
+        plugged = [each for each in (first, first + 1) if each in self.arm and not self.arm[each].unplugged]
+        if self.number == max(plugged, default=0):
             pair = (self.arm.get(number) for number in (first, first + 1))
             counts = (0 if each is None else each.position_counts() for each in pair)
             self.answer(0x2A5 + (first - 1) // 2, struct.pack(">ii", *counts))
 
     def position_counts(self) -> int:
-        return round(self.told().position / self.scale("position") / MILLIDEGREE)
+        counts = round(self.told().position / self.scale("position") / MILLIDEGREE)
+        return max(-MOST_COUNTS, min(MOST_COUNTS, counts))
 
     def _state(self) -> bytes:
         bits = 0x40 * self.enabled | ENCODER * ("feedback.lost" in self.faults)

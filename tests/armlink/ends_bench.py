@@ -16,7 +16,7 @@ from sim_bus.physics.plant import Plant
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-FALLING = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator")
+FALLING = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator", "six-piper")
 MASS = 0.3
 """On the tip [kg]."""
 EXTRA_SPEED = 1.0

@@ -30,7 +30,7 @@ from sim_bus.truth import Truth
 
 ALL = (
     *("six-damiao", "six-robstride", "six-cubemars", "six-moteus", "six-odrive", "six-myactuator"),
-    *("six-cia402", "sarcos"),
+    *("six-piper", "six-cia402", "sarcos"),
 )
 HOW = ("forged", "frozen", "doubled", "scaled")
 LEAST, MOST = 0.2, 5.0

@@ -26,7 +26,9 @@ from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
-TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
+TRAITS = Traits(
+    torque="current", calibration="host", silence="keeps on", kept="holds", bounds=(), cadence="reply", frame="11"
+)
 """Of a drive with the default keys; with a CAN timeout it lets go."""
 LISTEN = 0.1
 """A drive that answers another host is heard within this time [s]."""

@@ -29,7 +29,9 @@ from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
 T = TypeVar("T")
-TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
+TRAITS = Traits(
+    torque="current", calibration="host", silence="keeps on", kept="holds", bounds=(), cadence="reply", frame="11"
+)
 """Of a drive with the default keys; with a time-out it lets go."""
 POLLED = (RmdCommand.ERROR, RmdCommand.RUNTIME)
 LONGEST_PAUSE = 3_600_000
@@ -241,6 +243,9 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
             data = frames.pack_position(steps, speed)
         self.memory[joint].sent = self._order_of(joint, data)
         return data
+
+    def safe_frames(self, joint: int) -> Sequence[Frame]:
+        return () if self.memory[joint].sent is None else (self._frame(joint, request(RmdCommand.STOP)),)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         joint = self._joint_of.get(can_id - REPLY_ID)

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator
 from enum import IntFlag
 
-from armlink.drives.mit_packing import MitCommand, PackedField
+from armlink.drives.mit_packing import Grid, MitCommand, PackedField, Ranges
 
 JOINTS = range(1, 7)
 STOP_ID, MODE_ID, TARGETS_ID, MIT_ID, ENABLE_ID, FIRMWARE_ID = 0x150, 0x151, 0x155, 0x15A, 0x471, 0x4AF
@@ -31,6 +31,14 @@ firmware."""
 MIT_POSITION, MIT_VELOCITY = PackedField(-12.5, 12.5, 16), PackedField(-45.0, 45.0, 12)
 MIT_KP, MIT_KD, MIT_TORQUE = PackedField(0.0, 500.0, 12), PackedField(-5.0, 5.0, 12), PackedField(-8.0, 8.0, 8)
 """Fields of an MIT command [rad], [rad/s], [N·m/rad], [N·m·s/rad], [N·m]; the zero of kd lies between two steps."""
+MIT_BITS = (16, 12, 12, 11, 8)
+"""Bits of a command's fields, in the order of a grid; the twelfth bit of kd is its sign."""
+LEAST_KD = 1 << 11
+"""Steps of the smallest kd that does not push [12 bits]."""
+MOST_SPEED, MOST_CURRENT = 0x7FFF * MILLI, 0x7FFF * MILLI
+"""Ends of the readings [rad/s] and [A]."""
+BY_CAN, MOVE_M, MIT = 1, 4, 0xAD
+"""Mode of control, way of moving, and its mark, by which joints follow MIT commands."""
 ENABLE, DISABLE = 2, 1
 FIRMWARE = r"S-V\d+\.\d+-\d+"
 """Pattern of a firmware, such as S-V1.8-2."""
@@ -62,6 +70,17 @@ ARM_FAULTS = {
 """States of the arm that are faults."""
 
 _PAIR, _MOTION, _STATE = struct.Struct(">ii"), struct.Struct(">hhi"), struct.Struct(">HhbBH")
+
+
+class PiperGrid(Grid):
+    """The values that an MIT command can have, its torque as a joint makes it, and no kd that pushes."""
+
+    __slots__ = ()
+
+    def __init__(self, amplification: float) -> None:
+        ranges = Ranges(MIT_POSITION.largest, MIT_VELOCITY.largest, amplification * MIT_TORQUE.largest)
+        super().__init__(ranges, MIT_BITS)
+        self.kd = PackedField(MIT_KD.value(LEAST_KD), MIT_KD.largest, MIT_BITS[3])
 
 
 def amplification(joint: int, firmware: str) -> float:
@@ -96,6 +115,12 @@ def checksum(data: bytes) -> int:
     return result & 0xF
 
 
+def pack_mit(q: int, dq: int, kp: int, kd: int, torque: int) -> bytes:
+    """An MIT command from the steps of a PiperGrid."""
+    bits = q << 48 | dq << 36 | kp << 24 | (kd + LEAST_KD) << 12 | torque << 4
+    return (bits | checksum(bits.to_bytes(8, "big"))).to_bytes(8, "big")
+
+
 def unpack_mit(data: bytes) -> MitCommand | None:
     """An MIT command of eight bytes, its torque as it is said; None with a wrong checksum."""
     bits = int.from_bytes(data, "big")
@@ -108,6 +133,16 @@ def unpack_mit(data: bytes) -> MitCommand | None:
         max(MIT_KD.value(bits >> 12 & 0xFFF), 0.0),
         MIT_TORQUE.value(bits >> 4 & 0xFF),
     )
+
+
+def mit_mode() -> bytes:
+    """The command to all joints to follow MIT commands from CAN."""
+    return bytes([BY_CAN, MOVE_M, 100, MIT, 0, 0, 0, 0])
+
+
+def switch(joint: int, to: int) -> bytes:
+    """The command to a joint to take or to leave power, `to` ENABLE or DISABLE."""
+    return bytes([joint, to, 0, 0, 0, 0, 0, 0])
 
 
 def firmware_request() -> bytes:

@@ -83,6 +83,10 @@ class Bench:
     def hear(self, can_id: int, data: bytes) -> None:
         if can_id in self.fast:
             self.fast[can_id](data)
+            for joint, position in enumerate(self.board.position):
+                if position == position:
+                    self.latest[joint] = self.latest[joint]._replace(position=position)
+            self.board.drop()
         elif can_id in self.routes or -1 in self.routes:
             reading = self.drives.take(can_id, data, self.arm.time)
             if reading is not None:

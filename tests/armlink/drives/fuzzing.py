@@ -8,7 +8,10 @@ from bench import Bench
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.orders import Mode
 
-FAMILIES = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator", "six-cia402")
+FAMILIES = (
+    *("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator", "six-piper"),
+    "six-cia402",
+)
 """Arms with drives of each family."""
 
 

@@ -1,4 +1,4 @@
-"""AgileX Piper arms: their frames, what is read of them, and that they are never commanded."""
+"""AgileX Piper arms: their frames, what is read of them, when they are commanded, and beside their own host."""
 
 import math
 import struct
@@ -12,6 +12,8 @@ from wiretap import Tap
 
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.bus.port import REMOTE
+from armlink.drives.board import Board
+from armlink.drives.mit_packing import MitCommand
 from armlink.drives.orders import Mode, Power
 from armlink.drives.piper import frames
 from armlink.drives.piper.drives import find_drives
@@ -93,17 +95,109 @@ def test_torques_of_old_firmware_are_scaled_by_four_at_the_first_three_joints(jo
 # ---- reading
 
 
-def test_who_it_is_where_it_stands_and_that_nothing_is_sent_to_move_it():
+def test_a_command_is_packed_as_the_stock_client_packs_it_but_rounded_to_the_nearest_step():
+    grid = frames.PiperGrid(1.0)
+    for values in ((1.0, -2.0, 30.0, 0.5, 1.5), (-3.0, 0.0, 500.0, 5.0, -8.0), (12.5, 45.0, 0.0, 0.02, 8.0)):
+        packed = grid.steps(MitCommand(*values))
+        told = tuple(frames.unpack_mit(frames.pack_mit(*packed)))
+        assert told == pytest.approx(tuple(grid.command(*packed)))
+        assert told == pytest.approx(values, abs=500 / 4095 / 2 + 1e-9)
+        theirs = frames.unpack_mit(mit(*values))
+        steps = (25 / 65535, 90 / 4095, 500 / 4095, 10 / 4095, 16 / 255)
+        assert (np.abs(np.subtract(told, theirs)) <= np.array(steps) + 1e-9).all()
+
+
+def test_no_kd_pushes():
+    for kd in (0, 1, 2047):
+        assert frames.unpack_mit(frames.pack_mit(0, 0, 0, kd, 0)).kd > 0.0
+        assert int.from_bytes(frames.pack_mit(0, 0, 0, kd, 0), "big") >> 23 & 1  # the sign of kd, as the drive has it
+
+
+def test_who_it_is_and_where_it_stands():
     bench = Bench("six-piper")
     found = bench.drives.identify(bench)
     assert [(each.present, each.firmware, each.mismatch) for each in found] == [(True, "S-V1.6-3", "")] * 6
+    assert bench.drives.positions(bench) == pytest.approx(list(bench.arm.plant.position), abs=2e-3)
+    assert "keeps on with its last command" in bench.set_up()[0].notes[0]
+    assert {can_id for can_id, _ in bench.log} == {0x4AF}
     bench.simulated[0].firmware = "S-V1.9-0"
     assert "its firmware is S-V1.9-0, the arm file states S-V1.6-3" in bench.drives.identify(bench)[2].mismatch
-    assert bench.drives.positions(bench) == pytest.approx(list(bench.arm.plant.position), abs=2e-3)
-    assert "gives it no power" in bench.set_up()[0].notes[0]
-    for power in (Power.ON, Power.STOPPED, Power.OFF):
-        assert bench.drives.frames([bench.order(j, power=power, walk=True) for j in range(6)], 0.0) == []
-    assert {can_id for can_id, _ in bench.log} == {0x4AF}
+    with pytest.raises(Refused, match=r"base: the arm's firmware is S-V1\.9-0"):
+        bench.set_up()
+
+
+def test_an_arm_with_power_is_not_set_up_since_it_would_fall():
+    bench = Bench("six-piper")
+    bench.set_up()
+    assert bench.walk()
+    with pytest.raises(Refused, match=r"base: it has power: .* support the arm"):
+        Bench.set_up(bench)
+    assert all(bench.powered)
+
+
+def test_a_joint_has_a_command_to_hold_before_it_can_sink():
+    bench = Bench("six-piper")
+    bench.set_up()
+    bench.log.clear()
+    bench.walk()
+    ids = [can_id for can_id, data in bench.log if can_id != 0x151]
+    assert ids[:4] == [0x471, 0x15A, 0x471, 0x15B]
+
+
+def test_a_joint_that_left_the_arms_own_bus_is_silent_although_its_position_comes():
+    bench = Bench("six-piper")
+    bench.set_up()
+    bench.walk()
+    bench.simulated[4].unplugged = True  # the arm goes on to send the position of the pair
+    for _ in range(10):
+        bench.board.position = [math.nan] * 6
+        bench.cycle([bench.order(j, position=bench.position[j]) for j in range(6)])
+    bench.fast = bench.drives.fill(board := Board(6), range(6))
+    bench.cycle([bench.order(j, position=bench.position[j]) for j in range(6)])
+    assert [position == position for position in board.position] == [True] * 4 + [False, True]
+
+
+def test_an_arm_that_left_the_mode_of_its_commands_is_a_fault():
+    bench = Bench("six-piper")
+    bench.set_up()
+    bench.walk()
+    for joint in bench.simulated:
+        joint.mode = 1
+    for _ in range(10):
+        bench.cycle([bench.order(j, position=bench.position[j]) for j in range(6)])
+    assert "power is stopped, expected on" in str(bench.drives.fault([Mode.POSITION] * 6, bench.arm.time))
+
+
+@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.TORQUE])
+def test_what_a_keeper_sends_holds_the_arm_where_it_stands(mode):
+    """Under load, and without any command after it: nothing falls."""
+    bench = Bench("six-piper")
+    bench.set_up()
+    bench.walk()
+    start = bench.position
+    for _ in range(100):  # it carries itself in another pose
+        bench.cycle([bench.order(j, position=start[j] - 0.3 * (j == 1)) for j in range(6)])
+    carried = bench.arm.plant.motor_torque.copy()
+    for _ in range(3):
+        bench.cycle([bench.order(j, mode=mode, torque=carried[j] * (mode == Mode.TORQUE)) for j in range(6)])
+    for joint in range(6):
+        for frame in bench.drives.safe_frames(joint):
+            bench.send(*frame)
+    before = bench.arm.plant.position.copy()
+    bench.arm.advance(5.0)
+    assert np.abs(bench.arm.plant.position - before).max() < 0.05
+    assert np.abs(bench.arm.plant.velocity).max() < 0.02
+    assert all(bench.powered)
+
+
+def test_a_joint_without_power_has_nothing_to_send():
+    bench = Bench("six-piper")
+    bench.set_up()
+    assert [list(bench.drives.safe_frames(j)) for j in range(6)] == [[]] * 6
+    bench.walk()
+    assert all(bench.drives.safe_frames(j) for j in range(6))
+    bench.walk(Power.OFF)
+    assert [list(bench.drives.safe_frames(j)) for j in range(6)] == [[]] * 6
 
 
 def test_a_silent_arm():
@@ -111,16 +205,17 @@ def test_a_silent_arm():
     bench.arm.outbox.clear()
     bench.simulated[4].unplugged = True
     assert [each.present for each in bench.drives.identify(bench)] == [True] * 4 + [False, True]
-    with pytest.raises(BusFault, match="joint_5: nothing is heard of joint 5"):
+    with pytest.raises(BusFault, match="wrist_2: nothing is heard of joint 5"):
         bench.set_up()
 
 
-def test_it_gets_no_power():
+def test_without_a_keeper_it_gets_no_power():
     arm = load_arm("six-piper")
+    arm = arm.model_copy(update={"link": arm.link.model_copy(update={"keeper": False})})
     simulated = SimulatedArm(arm, Truth.of(arm))
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
-        with pytest.raises(Refused, match="joint_1: if this host dies, its drive keeps on"):
+        with pytest.raises(Refused, match=r"base: if this host dies, its drive keeps on .* `link.keeper: true`"):
             link.enable()
     assert not any(simulated.device(joint).motor.powered for joint in range(6))
 
@@ -131,7 +226,7 @@ def test_faults_of_a_joint_and_of_the_arm():
     bench.drives.take(0x2A1, bytes([1, 7, 1, 0, 0, 0, 0, 0]), 0.0)
     reading = bench.drives.take(0x261, bytes.fromhex("00F0001F21400000"), 0.0)
     assert (reading.power, reading.fault, reading.temperature) == (Power.FAULT, "collision", 33.0)
-    bench.drives.take(0x2A1, bytes(8), 0.0)
+    bench.drives.take(0x2A1, bytes([1, 0, 4, 0, 0, 0, 0, 0]), 0.0)
     assert bench.drives.take(0x261, bytes.fromhex("00F0001F21400000"), 0.0).power is Power.ON
     assert bench.drives.take(0x262, bytes.fromhex("00F0001F21100000"), 0.0).fault == "collision (state 10h)"
 
@@ -206,7 +301,7 @@ def talk(seconds, command):
 
 def swing(joint, t, start):
     omega = 4.0 + 0.3 * joint
-    side = -1.0 if joint == 2 else 1.0
+    side = -1.0 if joint == 3 else 1.0  # away from its stop
     way = 0.3 * side * (1 - math.cos(omega * t))
     return mit(start[joint] + way, 0.3 * side * omega * math.sin(omega * t), KP, KD)
 

@@ -15,7 +15,7 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-FALLING = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator")
+FALLING = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-myactuator", "six-piper")
 
 
 def without_park(name):

@@ -11,7 +11,16 @@ from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 SECONDS = 6.0
-ALL = ("six-damiao", "six-robstride", "six-moteus", "six-odrive", "six-cia402", "six-cubemars", "six-myactuator")
+ALL = (
+    "six-damiao",
+    "six-robstride",
+    "six-moteus",
+    "six-odrive",
+    "six-cia402",
+    "six-cubemars",
+    "six-myactuator",
+    "six-piper",
+)
 
 
 class Hand:

@@ -206,11 +206,16 @@ def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_
         assert "write `zero: 6.2832`" in named.remedy
 
 
-@pytest.mark.parametrize(("arm", "named"), [("six-piper", "joint_1, joint_2"), ("six-myactuator", ""), ("sarcos", "")])
-def test_joints_that_nothing_stops_when_their_host_dies_are_named(arm, named):
-    found = [each for each in examine(arm, offline=True) if "keep on with their last command" in each.what]
-    assert [each.level for each in found] == ["warning"] * bool(named)
-    assert all(named in each.what for each in found)
+def test_joints_that_nothing_stops_when_their_host_dies_are_named(tmp_path):
+    def found(arm):
+        return [each for each in examine(arm, offline=True) if "keep on with their last command" in each.what]
+
+    assert [found(arm) for arm in ("six-piper", "six-myactuator", "sarcos")] == [[], [], []]
+    unkept = tmp_path / "unkept.yaml"
+    unkept.write_text(bundled_arms()["six-piper"].read_text(encoding="utf-8").replace("keeper: true", "keeper: false"))
+    (named,) = found(unkept)
+    assert named.level == "warning"
+    assert "base, shoulder" in named.what
 
 
 def test_joints_of_which_no_reading_shows_a_lost_turn_are_listed(tmp_path):

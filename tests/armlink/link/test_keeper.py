@@ -1,0 +1,137 @@
+"""The keeper: when it sends what its host told it, when it does not, and how a host learns of it."""
+
+import signal
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import can
+import pytest
+
+from armlink.arm_file import Bus, LinkSection, load_arm
+from armlink.bus.port import EXTENDED
+from armlink.errors import BusFault, Refused
+from armlink.link import keeper
+from armlink.link.keeper import Keeper, keep, unpack_frames
+from armlink.link.link import Link
+from sim_bus.bus.lock_step import LockStepBus
+
+LONG = 20.0
+"""Longest wait on a busy machine [s]."""
+HOLD = [(0x15A, bytes(range(8))), (0x01000005 | EXTENDED, b"\x01")]
+
+
+class Host:
+    """A host's end of the channel, and what its keeper has sent."""
+
+    def __init__(self, silence):
+        self.channel, theirs = socket.socketpair()
+        self.sent = []
+        port = SimpleNamespace(send_all=lambda frames: self.sent.append(list(frames)))
+        self.thread = threading.Thread(target=keep, args=(theirs, port, silence), daemon=True)
+        self.thread.start()
+        self.keeper = Keeper.__new__(Keeper)
+        self.keeper.__dict__.update(_channel=self.channel, lost=False, heard=False, _told=keeper.deque(maxlen=4))
+
+    def renew(self, frames=HOLD):
+        self.keeper.renew(frames)
+
+    def until(self, count):
+        end = time.monotonic() + LONG
+        while len(self.sent) < count and time.monotonic() < end:
+            time.sleep(0.005)
+        return self.sent
+
+    def dies(self):
+        self.channel.close()
+        self.thread.join(LONG)
+
+
+def test_a_host_that_dies_leaves_its_newest_frames():
+    host = Host(silence=3600.0)
+    host.renew([(1, b"old")])
+    host.renew()
+    host.dies()
+    assert host.sent == [HOLD] * keeper.SENDINGS
+
+
+def test_a_host_that_stands_still_is_replaced_until_it_goes_on():
+    host = Host(silence=0.05)
+    host.renew()
+    assert host.until(keeper.SENDINGS) == [HOLD] * keeper.SENDINGS
+    host.renew([(2, b"new")])
+    assert host.until(keeper.SENDINGS + 1)[keeper.SENDINGS] == [(2, b"new")]
+    host.dies()
+
+
+def test_a_host_whose_drives_have_no_power_leaves_nothing():
+    host = Host(silence=3600.0)
+    host.renew()
+    host.renew([])
+    host.dies()
+    assert [frames for frames in host.sent if frames] == []
+
+
+def test_a_message_that_came_in_pieces_or_never_whole():
+    host, body = Host(silence=3600.0), keeper.HEAD.pack(7, 2) + b"ab"
+    message = keeper.LENGTH.pack(len(body)) + body
+    for byte in message + message[:-1]:
+        host.channel.send(bytes([byte]))
+        time.sleep(0.001)
+    host.dies()
+    assert host.sent == [[(7, b"ab")]] * keeper.SENDINGS
+    assert unpack_frames(b"") == []
+
+
+def test_a_keeper_that_ended_is_a_fault_once():
+    host = Host(silence=3600.0)
+    host.keeper._channel, other = socket.socketpair()
+    other.close()
+    with pytest.raises(BusFault, match="the keeper of this host has ended"):
+        host.renew()
+    host.renew()
+    host.dies()
+
+
+def test_its_frames_are_told_from_those_of_another_host():
+    host = Host(silence=3600.0)
+    host.renew()
+    for _ in range(keeper.REMEMBERED - 1):
+        host.renew([])
+    assert host.keeper.sends(HOLD[1])
+    assert host.keeper.heard
+    host.renew([])
+    assert not host.keeper.sends(HOLD[1])
+    host.dies()
+
+
+def section(channel):
+    bus = Bus(interface="udp_multicast", channel=channel)
+    link = load_arm("six-piper").require_link()
+    return LinkSection.model_validate({**link.model_dump(exclude={"bus"}), "bus": bus.model_dump()})
+
+
+def test_the_process_sends_on_a_bus_of_its_own_and_no_signal_of_a_terminal_ends_it():
+    group = "239.74.163.119"
+    with can.Bus(interface="udp_multicast", channel=group) as ear:
+        kept = Keeper(section(group), None)
+        kept.renew(HOLD[:1])
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            kept._process.send_signal(each)
+        kept._channel.close()  # as the kernel does it for a host that was killed
+        heard = ear.recv(LONG)
+        assert (heard.arbitration_id, bytes(heard.data)) == HOLD[0]
+        assert kept._process.wait(LONG) == 0
+
+
+def test_without_its_bus_no_power_is_given():
+    with pytest.raises(Refused, match=r"no keeper can watch this host .*: the drives would keep on"):
+        Keeper(section("239.74.163.119"), "socketcan:absent0")
+
+
+def test_an_arm_in_this_process_needs_none():
+    with Link(load_arm("six-piper"), LockStepBus("six-piper")) as link:
+        link.start()
+        link.enable()
+        assert link.commander.loop.keeper is None
