@@ -28,10 +28,10 @@ class Traits:
     torque_cycles: int = 1
     """Cycles from one torque reading to the next."""
     kept: Silence | None = None
-    """Of a drive that keeps on: what it does once a keeper (`armlink.link.keeper`) has sent its `safe_frames`."""
+    """Of a drive that keeps on: its reaction once a keeper (`armlink.link.keeper`) has sent its `safe_frames`."""
 
     def reaction(self, keeper: bool) -> Silence:
-        """What it does when its host falls silent, with a keeper or without."""
+        """Its reaction to a silent host, with a keeper or without."""
         return self.kept if keeper and self.kept and self.silence == "keeps on" else self.silence
 
     def as_json(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ NEWTON_METERS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
 """By the ampere, as the SDK converts currents."""
 MIT, MOVE_M, TARGETS = 0xAD, 4, 1
 MOST_COUNTS = 0x7FFFFFFF
+"""Of a position, a whole number of 32 bits [0.001°]."""
 ENCODER = 0x20
 """Bit of a joint's state: its drive has an error."""
 

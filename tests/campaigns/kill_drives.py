@@ -7,6 +7,7 @@ where it stood by the keeper of its host. Exit status 0 where it was so in every
 """
 
 import argparse
+import json
 import os
 import signal
 import subprocess
@@ -133,6 +134,8 @@ def main() -> int:
     if asked.push:
         (push_kept if asked.push in KEPT else push)(asked.push, asked.group)
         return 0
+    # a port of one's own: all groups on one port hear each other
+    os.environ["CAN_CONFIG"] = json.dumps({"port": 43200 + os.getpid() % 1000})
     failed = 0
     for name in asked.family:
         fd = name == "moteus"

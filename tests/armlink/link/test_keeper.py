@@ -1,5 +1,6 @@
 """The keeper: when it sends what its host told it, when it does not, and how a host learns of it."""
 
+import os
 import signal
 import socket
 import threading
@@ -106,16 +107,18 @@ def test_its_frames_are_told_from_those_of_another_host():
     host.dies()
 
 
-def section(channel):
-    bus = Bus(interface="udp_multicast", channel=channel)
+GROUP, PORT = "239.74.163.119", 44200 + os.getpid() % 1000  # all groups on one port hear each other
+
+
+def section():
+    bus = Bus(interface="udp_multicast", channel=GROUP, options={"port": PORT})
     link = load_arm("six-piper").require_link()
     return LinkSection.model_validate({**link.model_dump(exclude={"bus"}), "bus": bus.model_dump()})
 
 
 def test_the_process_sends_on_a_bus_of_its_own_and_no_signal_of_a_terminal_ends_it():
-    group = "239.74.163.119"
-    with can.Bus(interface="udp_multicast", channel=group) as ear:
-        kept = Keeper(section(group), None)
+    with can.Bus(interface="udp_multicast", channel=GROUP, port=PORT) as ear:
+        kept = Keeper(section(), None)
         kept.renew(HOLD[:1])
         for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             kept._process.send_signal(each)
@@ -127,7 +130,7 @@ def test_the_process_sends_on_a_bus_of_its_own_and_no_signal_of_a_terminal_ends_
 
 def test_without_its_bus_no_power_is_given():
     with pytest.raises(Refused, match=r"no keeper can watch this host .*: the drives would keep on"):
-        Keeper(section("239.74.163.119"), "socketcan:absent0")
+        Keeper(section(), "socketcan:absent0")
 
 
 def test_an_arm_in_this_process_needs_none():
