@@ -96,8 +96,16 @@ def push(name: str, group: str) -> None:
     host.until(lambda: False, order, 3600.0)
 
 
+def at_rest(arm: serving.Served) -> None:
+    """As after the hand that supported it and switched its power off and on."""
+    arm.drive.reboot()
+    arm.arm.plant.place(0, 0.0)
+
+
 def one_try(name: str, arm: serving.Served, group: str, number: int, how: signal.Signals) -> float:
     """Seconds from the kill until the drive was as its traits say; infinite if it never was."""
+    if name in KEPT:
+        arm.do(lambda: at_rest(arm))
     command = [sys.executable, __file__, "--push", name, "--group", group]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as host:
         assert host.stdout is not None
@@ -115,7 +123,6 @@ def one_try(name: str, arm: serving.Served, group: str, number: int, how: signal
                 furthest = max(furthest, abs(arm.angle - stood))
                 time.sleep(0.01)
             host.kill()
-            arm.do(arm.drive.reboot)  # by hand, as the page has it
             return took if done and furthest < HELD else float("inf")
         described = serving.pendulum(DRIVES[name], bus={"interface": "virtual", "fd": name == "moteus"})
         falls = family(name).build(described, described.require_link().joints).traits(0).silence == "falls"
@@ -141,7 +148,10 @@ def main() -> int:
         fd = name == "moteus"
         with serving.served(DRIVES[name], fd=fd, bus=bus_of(asked.group, fd), deadline=DEADLINE) as arm:
             how = signal.SIGSTOP if asked.stop else signal.SIGKILL
-            times = [one_try(name, arm, asked.group, number, how) for number in range(asked.tries)]
+            times = []
+            for number in range(asked.tries):
+                times.append(one_try(name, arm, asked.group, number, how))
+                print(f"{name}: {number + 1} of {asked.tries}: {times[-1]:.3f} s", file=sys.stderr, flush=True)
         not_begun = sum(seconds < 0 for seconds in times)
         never = sum(seconds == float("inf") for seconds in times)
         worst = max([seconds for seconds in times if 0 <= seconds < float("inf")], default=0.0)
