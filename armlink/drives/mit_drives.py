@@ -111,7 +111,10 @@ class MitDrives(BasicDrives[K]):
         return self._sent(joint, grid, grid.steps(command), Power.STOPPED)
 
     def safe_frames(self, joint: int) -> Sequence[Frame]:
-        """It holds where it stands, with the torque that the newest order came to there; it damps where it damped."""
+        """It holds where it stands, with the torque that the newest order came to there; it damps where it damped.
+
+        The stiffer, the more a joint is pulled that moves on until the frame comes: within its torque limit.
+        """
         known, settings = self.memory[joint], self.settings[joint]
         if known.sent is None:
             return ()
@@ -119,9 +122,12 @@ class MitDrives(BasicDrives[K]):
         if known.damping or not math.isfinite(position):
             steps = grid.steps(damping(settings.kd, position, velocity, limits.max_torque))
         else:
-            torque = law_torque(known.sent, position, velocity if math.isfinite(velocity) else 0.0)
-            target = max(limits.lower, min(limits.upper, position))
-            held = MitCommand(target, 0.0, settings.kp, settings.kd, torque)
+            speed = velocity if math.isfinite(velocity) else 0.0
+            torque = law_torque(known.sent, position, speed)
+            target, drift = max(limits.lower, min(limits.upper, position)), abs(speed) * limits.deadline
+            room = max(limits.max_torque - abs(torque), 0.0)
+            kp = room / drift if settings.kp * drift > room else settings.kp
+            held = MitCommand(target, 0.0, kp, settings.kd, torque)
             steps = round_within(held, grid, limits, position, velocity)
         return (self.coded(joint, steps),)
 

@@ -308,7 +308,8 @@ class Loop:
         for group in self.groups:
             drives = group.drives
             for joint in range(len(group.places)):
-                for can_id, data in drives.safe_frames(joint):
+                keeps_on = drives.traits(joint).silence == "keeps on"
+                for can_id, data in drives.safe_frames(joint) if keeps_on else ():
                     for _, order in drives.commands_of(can_id, data):
                         known, limits = drives.memory[joint], drives.limits_of(joint)
                         torque = law_torque(order, known.position, known.velocity)

@@ -44,6 +44,11 @@ def announcement(arm: ArmFile) -> str:
             f"reacts. By the traits of the drives, {told}. A joint whose drive does not report its state is "
             f"turned by {LEAN} rad before that."
         )
+        if any(each.silence != each.reaction(keeper) for each in traits):
+            steps += (
+                f" Last, no joint gets commands for {PATIENCE * deadline:.0f} ms, in which the keeper must hold those "
+                "whose drives keep on."
+            )
     end = "the joints hold, in quick stop"
     if not all(each.silence == "holds" for each in traits):
         end = "the arm is parked or slowly lowered, and its power switched off"

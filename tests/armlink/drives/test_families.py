@@ -348,6 +348,8 @@ def check_safe(name, bench, joint):
         if math.isfinite(reading.position + reading.velocity):
             total = kp * (position - reading.position) + kd * (velocity - reading.velocity) + torque
             assert abs(total) <= limits.max_torque + 1e-9
+            drift, step = abs(reading.velocity) * limits.deadline, 500 / 4095
+            assert (kp - step) * drift <= limits.max_torque
 
 
 numbers = st.one_of(

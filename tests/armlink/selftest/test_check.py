@@ -207,7 +207,8 @@ def test_on_another_bus_it_asks_first(capsys):
             ("up to 300 ms", "wrist_3: falls (damiao)", "parked or slowly lowered"),
             ("quick", "heartbeat"),
         ),
-        ("six-moteus", ("wrist_3: damps (moteus)",), ("quick", "heartbeat")),
+        ("six-moteus", ("wrist_3: damps (moteus)",), ("quick", "heartbeat", "keeper")),
+        ("six-piper", ("wrist_3: holds (piper)", "Last, no joint gets commands", "keeper must hold"), ("heartbeat",)),
     ],
 )
 def test_it_announces_what_it_tests_of_these_drives(arm, says, never, capsys):
