@@ -62,7 +62,7 @@ def with_lever(candidates: Candidates) -> Candidates:
 
 @dataclass(frozen=True, eq=False)
 class StopDesign:
-    """What each joint's candidates tell of the unknowns."""
+    """The design matrices of each joint's candidates, and the prior."""
 
     candidates: list[Candidates]
     rows: list[Array]
