@@ -131,6 +131,9 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
 MINOR = 0.6
 """Share of the smallest relevant gap of the rows in which it shows by which a cause must lower some joint's RMS not to
 be minor."""
+WITHIN_NM = 0.08
+"""Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
+could explain them."""
 
 
 def relevant_terms(
@@ -148,7 +151,8 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, heldout.relevant_nm)
+    absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
+    least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
     others = [term for term in estimate.terms if term not in step.terms]
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
     falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
