@@ -51,7 +51,7 @@ def listen(listener: ArmListener, recording: Recording, frame: WrenchFrame, per_
             rows, when = model.rows(filtered), t[part][filtered.chosen]
             judged, events = detector.judge(when, rows)
             motion, spread = filtered.motion, model.lasting
-            told = wrench(motion, frame.link, frame.point, judged.external, judged.std, spread.correlation)
+            told = wrench(motion, frame.link, frame.point, judged.external, judged.std, spread.precision)
             least = smallest_force(
                 model, detector.sudden_limit, motion, frame.link, frame.point, judged.change_std, model.sudden
             )

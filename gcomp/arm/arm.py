@@ -1,6 +1,7 @@
 """The arm as gravity sees it: Denavit-Hartenberg rows, gravity in the base frame, joint range."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,7 +56,7 @@ class Arm:
     def n(self) -> int:
         return len(self.names)
 
-    @property
+    @cached_property
     def span(self) -> Array:
         """From each joint's origin to the next one's, in its bar frame (n, 3) [m]."""
         return np.stack([self.a, as_array("b", self.b, (self.n,)), self.d], axis=1)

@@ -12,7 +12,16 @@ import numpy as np
 
 from gcomp.arrays import Array
 from gcomp.estimate.posterior import linear_posterior
-from gcomp.external.external_model import BEGINNING, BLOCK, DRIFT, ROWS_RATE, SLOW, ExternalModel, TorqueRows
+from gcomp.external.external_model import (
+    BEGINNING,
+    BLOCK,
+    DRIFT,
+    ROWS_RATE,
+    SLOW,
+    ExternalModel,
+    TorqueRows,
+    model_variance,
+)
 from gcomp.external.rigid_motion import INERTIAL, RigidMotion, jacobian
 
 FEWEST_MAXIMA = 5
@@ -114,8 +123,7 @@ class ContactDetector:
         n = model.arm.n
         self.tool = np.zeros(3) if tool is None else tool
         self.lasting_limit, self.sudden_limit = (threshold(each, per_hour / 2.0, n) for each in model.maxima)
-        self._lasting_inverse = np.linalg.inv(model.lasting.correlation)
-        self._sudden_inverse = np.linalg.inv(model.sudden.correlation)
+        self._lasting_inverse, self._sudden_inverse = model.lasting.precision, model.sudden.precision
         back = np.linalg.inv(model.split)
         self._load_columns = back[:, INERTIAL * (n - 1) : INERTIAL * (n - 1) + 4]
         self.load = np.zeros(4)
@@ -129,9 +137,9 @@ class ContactDetector:
     def judge(self, t: Array, rows: TorqueRows) -> tuple[JudgedRows, list[ContactEvent]]:
         """Rows at times (S,) [s]."""
         model, events = self.model, list[ContactEvent]()
-        own = model.model_variance(rows)
-        std = model.lasting.std(rows.state, own)
-        change_std = self._change_std(rows)
+        both = np.concatenate([rows.columns, self._away(rows.columns)])
+        own, of_change = np.split(model_variance(both, model.factors), 2)
+        std, change_std = model.lasting.std(rows.state, own), model.sudden.std(rows.state, of_change)
         left = -rows.left
         loaded = -(rows.by_link @ self._load_columns)
         external, deviation = np.empty_like(left), np.empty(len(left))
@@ -151,19 +159,16 @@ class ContactDetector:
             )
         return JudgedRows(external, std, change_std, deviation), events
 
-    def _change_std(self, rows: TorqueRows) -> Array:
-        """Standard deviation of the rows' change since before (S, n) [N·m]."""
-        columns = np.concatenate([rows.by_link, rows.by_joint], axis=-1)
+    def _away(self, columns: Array) -> Array:
+        """Columns (S, n, Q) less what they were before."""
         away, share = np.empty_like(columns), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
         for row, each in enumerate(columns):
             if self._slow_columns is None or self._seen + row < BEGINNING_ROWS:
-                self._slow_columns = each
-            away[row] = each - self._slow_columns
+                self._slow_columns = each.copy()
+            np.subtract(each, self._slow_columns, out=away[row])
             count = self._seen + row - BEGINNING_ROWS + 1
-            self._slow_columns = self._slow_columns + max(share, 1.0 / max(count, 1)) * away[row]
-        shared = rows.by_link.shape[2]
-        change = TorqueRows(rows.left, away[..., :shared], away[..., shared:], rows.state, rows.motion)
-        return self.model.sudden.std(rows.state, self.model.model_variance(change))
+            self._slow_columns += max(share, 1.0 / max(count, 1)) * away[row]
+        return away
 
     def _share(self) -> float:
         """Weight of a row in the mean of what was before."""

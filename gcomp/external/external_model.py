@@ -8,6 +8,7 @@ not known), whose sizes are those of maximum likelihood.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +62,8 @@ class TorqueRows:
 
     left: Array
     """Filtered torque less what is expected (S, n) [N·m]; a contact's has the opposite sign."""
-    by_link: Array
-    """(S, n, 10 n), as `gravity_split` has the parameters."""
-    by_joint: Array
-    """(S, n, C)."""
+    columns: Array
+    """By all of a joint's parameters (S, n, 10 n + C): the links', as `gravity_split` has them, and its own."""
     state: Array
     """Components of variance (S, n, B) but for the model's own."""
     motion: RigidMotion
@@ -72,24 +71,35 @@ class TorqueRows:
     def __len__(self) -> int:
         return len(self.left)
 
+    @property
+    def by_link(self) -> Array:
+        """(S, n, 10 n)."""
+        return self.columns[..., : INERTIAL * self.left.shape[1]]
+
+    @property
+    def by_joint(self) -> Array:
+        """(S, n, C)."""
+        return self.columns[..., INERTIAL * self.left.shape[1] :]
+
     def part(self, rows: slice | Mask) -> "TorqueRows":
-        return TorqueRows(
-            self.left[rows], self.by_link[rows], self.by_joint[rows], self.state[rows], self.motion.part(rows)
-        )
+        return TorqueRows(self.left[rows], self.columns[rows], self.state[rows], self.motion.part(rows))
 
 
 def rows_of(filtered: FilteredRows, split: Array, joints: Array) -> TorqueRows:
-    own = filtered.joints[filtered.chosen]
-    left = filtered.torque - filtered.links - (filtered.joints * joints).sum(-1)
-    return TorqueRows(left[filtered.chosen], filtered.by_link @ split, own, _state(filtered), filtered.motion)
+    chosen = filtered.chosen
+    own = filtered.joints[chosen]
+    left = filtered.torque[chosen] - filtered.links[chosen] - (own * joints).sum(-1)
+    columns = np.concatenate([filtered.by_link @ split, own], axis=-1)
+    return TorqueRows(left, columns, _state(filtered.state[chosen]), filtered.motion)
 
 
-def _state(filtered: FilteredRows) -> Array:
-    """Components of a joint's variance: constant, of its own state, and of how the whole arm moves."""
-    still, turning, speed, push = np.moveaxis(filtered.state[filtered.chosen], -1, 0)
-    speed, push = (speed / SPEED) ** 2, (push / PUSH) ** 2
-    whole = [np.broadcast_to(each.mean(axis=1, keepdims=True), each.shape) for each in (speed, push)]
-    return np.stack([np.ones_like(speed), still, turning, speed, push, *whole], axis=-1)
+def _state(state: Array) -> Array:
+    """Components of a joint's variance: constant, of its own state (S, n, 4), and of how the whole arm moves."""
+    out = np.empty((*state.shape[:-1], COMPONENTS - 1))
+    out[..., 0], out[..., 1:3] = 1.0, state[..., :2]
+    out[..., 3:5] = (state[..., 2:] / (SPEED, PUSH)) ** 2
+    out[..., 5:7] = out[..., 3:5].mean(axis=1, keepdims=True)
+    return out
 
 
 COMPONENTS = 8
@@ -110,6 +120,11 @@ class Spread:
     correlation: Array
     """Of the joints (n, n)."""
 
+    @cached_property
+    def precision(self) -> Array:
+        """Inverse of the correlation (n, n)."""
+        return np.asarray(np.linalg.inv(self.correlation))
+
     def std(self, state: Array, model: Array) -> Array:
         """(S, n) [N·m], from the components and the model's own variance (S, n)."""
         share = state[..., 1]
@@ -120,7 +135,7 @@ class Spread:
     def deviation(self, left: Array, std: Array) -> Array:
         """Square of the distance from nothing (S,), in standard deviations over all joints."""
         scaled = left / std
-        return np.asarray(np.einsum("si,ij,sj->s", scaled, np.linalg.inv(self.correlation), scaled))
+        return np.asarray(np.einsum("si,ij,sj->s", scaled, self.precision, scaled))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +178,7 @@ class ExternalModel:
 
     def model_variance(self, rows: TorqueRows) -> Array:
         """Of the expected torque (S, n) [N²·m²]."""
-        return model_variance(rows, self.factors)
+        return model_variance(rows.columns, self.factors)
 
 
 def stride_of(rate: float) -> int:
@@ -177,11 +192,10 @@ def expected(rows: TorqueRows, change: Array) -> Array:
     return np.asarray(rows.by_link @ change[:shared] + (rows.by_joint * own).sum(-1))
 
 
-def model_variance(rows: TorqueRows, factors: Array) -> Array:
-    out = np.empty(rows.left.shape)
-    for j, factor in enumerate(factors):
-        out[:, j] = ((np.hstack([rows.by_link[:, j], rows.by_joint[:, j]]) @ factor) ** 2).sum(-1)
-    return out
+def model_variance(columns: Array, factors: Array) -> Array:
+    """Variance (S, n) of what columns (S, n, Q) expect."""
+    spread = columns.swapaxes(0, 1) @ factors
+    return np.asarray(np.einsum("jsq,jsq->sj", spread, spread))
 
 
 def _factors(covariance: Array, n: int) -> Array:
@@ -242,28 +256,16 @@ def learn(arm: Arm, prior: ArmPrior, runs: Sequence[Samples], rate: float, scale
 
 
 def joined(parts: Sequence[TorqueRows]) -> TorqueRows:
-    moves = [part.motion for part in parts]
-    motion = RigidMotion(
-        moves[0].gravity,
-        np.concatenate([each.rotation for each in moves]),
-        np.concatenate([each.origin for each in moves]),
-        np.concatenate([each.screw for each in moves]),
-        np.concatenate([each.rate for each in moves]),
-        np.concatenate([each.screw_rate for each in moves]),
+    left, columns, state = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("left", "columns", "state")
     )
-    return TorqueRows(
-        np.concatenate([part.left for part in parts]),
-        np.concatenate([part.by_link for part in parts]),
-        np.concatenate([part.by_joint for part in parts]),
-        np.concatenate([part.state for part in parts]),
-        motion,
-    )
+    return TorqueRows(left, columns, state, RigidMotion.joined([part.motion for part in parts]))
 
 
 def change_of(rows: TorqueRows) -> TorqueRows:
     """Rows less what they were before."""
-    left, by_link, by_joint = (each - slow_mean(each) for each in (rows.left, rows.by_link, rows.by_joint))
-    return TorqueRows(left, by_link, by_joint, rows.state, rows.motion)
+    left, columns = (each - slow_mean(each) for each in (rows.left, rows.columns))
+    return TorqueRows(left, columns, rows.state, rows.motion)
 
 
 def drift(left: Array) -> Array:
@@ -339,10 +341,9 @@ class _Fit:
                 self.right[fold, j, place] = design.T @ self.rows.left[folds == fold, j]
 
     def _design(self, j: int, rows: Mask) -> tuple[NDArray[np.intp], Array]:
-        own = self.rows.by_joint.shape[2]
+        own = self.rows.columns.shape[2] - self.shared
         place = np.append(np.arange(self.shared), self.shared + j * own + np.arange(own))
-        design = np.hstack([self.rows.by_link[rows, j], self.rows.by_joint[rows, j]])
-        return place, design * self.scale[place]
+        return place, self.rows.columns[rows, j] * self.scale[place]
 
     def result(self) -> tuple[Array, Array, Array, Array, Array, Array]:
         """Mean (P,) and covariance (P, P) of the parameters; what is left of rows not seen, the model's variance of it,
@@ -371,7 +372,7 @@ class _Fit:
             for k, rows in enumerate((self.rows, self.change)):
                 part = rows.part(own)
                 out[2 * k, own] = part.left - expected(part, mean)
-                out[2 * k + 1, own] = model_variance(part, factors)
+                out[2 * k + 1, own] = model_variance(part.columns, factors)
         return out[0], out[1], out[2], out[3]
 
 

@@ -9,6 +9,7 @@ parameters: those of the links, and those of each joint's friction, sensor and r
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -38,6 +39,9 @@ JOINT_COLUMNS = (
     "warm_coulomb", "warm_viscous", "warm_offset", "warm_gain", "rotor", "gain",
 )  # fmt: skip
 """Columns of a joint's own parameters, before the waves."""
+COLUMNS = len(JOINT_COLUMNS) + WAVES
+AT_ONCE = 32
+"""Rows of a filter that are one product of matrices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,7 @@ class RowFilter:
         )
         self._begun = False
         self._count = 0
+        self._state: dict[str, tuple[Array, Array, Array]] = {}
         random = np.random.default_rng(1)
         n = arm.n
         self._direction = random.normal(size=(2 * n, WAVES)) / WAVE_LENGTH
@@ -102,19 +107,16 @@ class RowFilter:
             self._bristle = np.zeros((len(PRESLIDING), self.arm.n))
             self._last = q[0].copy()
             self._held = np.zeros((self.arm.n, len(STATES)))
+            self._begun = True
         motion = rigid_motion(self.arm, q, v)
-        momentum, rest = momentum_terms(motion, self.links)
-        gravity = -rest if not v.any() else -momentum_terms(rigid_motion(self.arm, q, 0.0 * v), self.links)[1]
-        columns, state = self._columns(samples, gravity)
+        momentum, rest, gravity = momentum_terms(motion, self.links)
+        direct, state = np.empty((*q.shape, 2 + COLUMNS)), np.empty((*q.shape, len(STATES)))
+        direct[..., 0], direct[..., 1] = samples.torque, -rest
+        self._columns(samples, gravity, direct[..., 2:], state)
         first = self._count % self.stride
         chosen = slice((self.stride - first) % self.stride, None, self.stride)
         self._count += len(q)
-        direct = np.concatenate([samples.torque[..., None], -rest[..., None], columns], axis=-1)
-        moving = np.concatenate([momentum[..., None], v[..., None]], axis=-1)
-        if not self._begun:
-            self._state = {"direct": (direct[0].copy(), direct[0].copy()), "moving": (moving[0].copy(),) * 2}
-        passed = self._low_pass("direct", direct)
-        pushed = self._pushed("moving", moving)
+        passed, pushed = self._filtered("torque", direct, np.stack([momentum, v], axis=-1))
         links = passed[..., 1] + pushed[..., 0]
         joints = passed[..., 2:]
         joints[..., JOINT_COLUMNS.index("rotor")] = pushed[..., 1]
@@ -122,95 +124,110 @@ class RowFilter:
         thin = slice((-first) % self._thin, None, self._thin)
         if derivatives and len(q[thin]):
             by_momentum, by_rate = momentum_regressors(motion.part(thin))
-            if "by_rate" not in self._state:
-                self._state["by_rate"] = (-by_rate[0], -by_rate[0])
-                self._state["by_momentum"] = (by_momentum[0].copy(),) * 2
-            both = self._low_pass("by_rate", -by_rate, self._thin) + self._pushed(
-                "by_momentum", by_momentum, self._thin
-            )
+            both = np.add(*self._filtered("links", -by_rate, by_momentum, self._thin))
             by_link = both[(np.arange(len(q))[thin] + first) % self.stride == 0]
-        self._begun = True
+        np.abs(pushed[..., 1], out=state[..., STATES.index("push")])
         return FilteredRows(
-            passed[..., 0], links, joints, by_link, self._remembered(state, pushed[..., 1]), chosen, motion.part(chosen)
+            passed[..., 0], links, joints, by_link, self._remembered(state), chosen, motion.part(chosen)
         )
 
-    def _columns(self, samples: Samples, gravity: Array) -> tuple[Array, Array]:
-        """Columns of the joints' own parameters, and their states but for the acceleration."""
+    def _columns(self, samples: Samples, gravity: Array, out: Array, state: Array) -> None:
+        """Columns of the joints' own parameters (K, n, C), and their states but for the acceleration."""
         q, v, warm = samples.position, samples.velocity, samples.warmth
         narrow, wide = self._bristles(q)
+        cos, sin = np.cos(q), np.sin(q)
         speed = np.abs(v)
-        side = narrow * np.minimum(1.0, speed / STRIBECK_SPEED) + wide * np.maximum(0.0, 1.0 - speed / STRIBECK_SPEED)
-        waves = self._waves(q)
+        pace = speed / STRIBECK_SPEED
+        side = narrow * np.minimum(1.0, pace) + wide * np.maximum(0.0, 1.0 - pace)
         own = {
-            "offset": np.ones_like(q),
+            "offset": 1.0,
             "coulomb": narrow,
             "coulomb_wide": wide,
-            "breakaway": narrow * np.exp(-speed / STRIBECK_SPEED),
+            "breakaway": narrow * np.exp(-pace),
             "load": side * np.abs(gravity),
             "viscous": v,
             "quadratic": v * speed,
-            "uneven_cos": narrow * np.cos(q),
-            "uneven_sin": narrow * np.sin(q),
+            "uneven_cos": narrow * cos,
+            "uneven_sin": narrow * sin,
             "warm_coulomb": narrow * warm,
             "warm_viscous": v * warm,
             "warm_offset": warm,
             "warm_gain": gravity * warm,
-            "rotor": np.zeros_like(q),
+            "rotor": 0.0,
             "gain": gravity,
         }
-        columns = np.stack([own[name] for name in JOINT_COLUMNS], axis=-1)
-        shared = np.broadcast_to(waves[:, None], (*q.shape, WAVES))
-        still = np.exp(-((v / (0.2 * STRIBECK_SPEED)) ** 2))
-        return np.concatenate([columns, shared], axis=-1), np.stack([still, 1.0 - wide**2, speed], axis=-1)
+        for k, name in enumerate(JOINT_COLUMNS):
+            out[..., k] = own[name]
+        waves = np.cos(np.concatenate([cos, sin], axis=1) @ self._direction + self._phase)
+        out[..., len(JOINT_COLUMNS) :] = np.sqrt(2.0 / WAVES) * waves[:, None]
+        state[..., 0] = np.exp(-((pace / 0.2) ** 2))
+        state[..., 1], state[..., 2] = 1.0 - wide**2, speed
 
-    def _remembered(self, state: Array, acceleration: Array) -> Array:
-        """States, each at its largest of the time that counts."""
-        out = np.concatenate([state, np.abs(acceleration)[..., None]], axis=-1)
-        keep = float(np.exp(-1.0 / (REMEMBERED * self.rate)))
-        for row in out:
-            np.maximum(row, keep * self._held, out=row)
-            self._held = row
-        self._held = self._held.copy()
+    def _remembered(self, state: Array) -> Array:
+        """States (K, n, 4), each at its largest of the time that counts."""
+        keep, out = float(np.exp(-1.0 / (REMEMBERED * self.rate))), np.empty_like(state)
+        for begin in range(0, len(state), AT_ONCE):
+            part = state[begin : begin + AT_ONCE]
+            faded = (keep ** np.arange(1, len(part) + 1))[:, None, None]
+            largest = np.maximum.accumulate(part / faded, axis=0)
+            out[begin : begin + AT_ONCE] = np.maximum(largest, self._held) * faded
+            self._held = out[begin + len(part) - 1].copy()
         return out
 
     def _bristles(self, q: Array) -> Array:
         """Direction of friction (2, K, n), -1 to 1, by the way since a reversal and not by time: it stays at rest."""
-        steps = np.diff(q, axis=0, prepend=self._last[None])
-        out = np.empty((len(PRESLIDING), *q.shape))
-        for k, way in enumerate(PRESLIDING):
-            value = self._bristle[k]
-            scaled = steps / way
-            for row, step in enumerate(scaled):
-                value = np.minimum(np.maximum(value + step, -1.0), 1.0)
-                out[k, row] = value
-            self._bristle[k] = value
-        self._last = q[-1].copy()
-        return out
+        steps = np.empty_like(q)
+        steps[0], steps[1:] = q[0] - self._last, q[1:] - q[:-1]
+        out = np.empty((len(q), len(PRESLIDING), q.shape[1]))
+        np.divide(steps[:, None], np.array(PRESLIDING)[:, None], out=out)
+        value = self._bristle
+        for row in out:
+            row += value
+            np.maximum(row, -1.0, out=row)
+            value = np.minimum(row, 1.0, out=row)
+        self._bristle, self._last = value.copy(), q[-1].copy()
+        return out.swapaxes(0, 1)
 
-    def _waves(self, q: Array) -> Array:
-        around = np.concatenate([np.cos(q), np.sin(q)], axis=1)
-        return np.asarray(np.sqrt(2.0 / WAVES) * np.cos(around @ self._direction + self._phase))
-
-    def _low_pass(self, name: str, values: Array, thin: int = 1) -> Array:
-        """Filtered, (K, …); between two samples values go straight."""
-        from scipy.signal import lfilter
-
-        before, state = self._state[name]
+    def _filtered(self, name: str, values: Array, moving: Array, thin: int = 1) -> tuple[Array, Array]:
+        """`values` (K, …) filtered, straight between two samples, and the filtered rate of change of `moving`."""
+        keep, share = _kept(BANDWIDTH * thin / self.rate)
+        if name not in self._state:
+            self._state[name] = (values[0], values[0], moving[0])
+        before, passed, pushed = self._state[name]
         middle = values.copy()
         middle[1:] += values[:-1]
         middle[0] += before
-        keep = float(np.exp(-BANDWIDTH * thin / self.rate))
-        out, _ = lfilter([0.5 * (1.0 - keep)], [1.0, -keep], middle, axis=0, zi=keep * state[None])
-        self._state[name] = values[-1].copy(), out[-1].copy()
-        return np.asarray(out)
+        middle *= 0.5 * share
+        out, smooth = faded_sums(middle, keep, passed), faded_sums(share * moving, keep, pushed)
+        self._state[name] = values[-1].copy(), out[-1].copy(), smooth[-1].copy()
+        rate = np.empty_like(smooth)
+        np.subtract(smooth[0], pushed, out=rate[0])
+        np.subtract(smooth[1:], smooth[:-1], out=rate[1:])
+        rate *= self.rate / thin
+        return out, rate
 
-    def _pushed(self, name: str, values: Array, thin: int = 1) -> Array:
-        """Filtered rate of change, (K, …)."""
-        from scipy.signal import lfilter
 
-        _, state = self._state[name]
-        keep = float(np.exp(-BANDWIDTH * thin / self.rate))
-        out, _ = lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=keep * state[None])
-        rate = np.diff(out, axis=0, prepend=state[None]) * self.rate / thin
-        self._state[name] = values[-1].copy(), out[-1].copy()
-        return np.asarray(rate)
+def _kept(decay: float) -> tuple[float, float]:
+    keep = float(np.exp(-decay))
+    return keep, 1.0 - keep
+
+
+def faded_sums(values: Array, keep: float, before: Array) -> Array:
+    """y_k = keep y_{k-1} + x_k for x (K, …); a few rows at once, as one product."""
+    out = np.empty(values.shape)
+    flat, into, last = values.reshape(len(values), -1), out.reshape(len(values), -1), before.reshape(-1)
+    for begin in range(0, len(values), AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        part = flat[rows]
+        weights, faded = _weights(keep, len(part))
+        np.matmul(weights, part, out=into[rows])
+        into[rows] += faded * last
+        last = into[begin + len(part) - 1]
+    return out
+
+
+@lru_cache(maxsize=64)
+def _weights(keep: float, count: int) -> tuple[Array, Array]:
+    """(Of each row in the sums up to each row (count, count), of the sum before them (count, 1))."""
+    row = np.arange(count)
+    return np.tril(np.power(keep, np.abs(row[:, None] - row))), np.asarray(np.power(keep, 1.0 + row[:, None]))

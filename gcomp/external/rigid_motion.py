@@ -7,17 +7,18 @@ With p = M(q) q̇ the generalised momentum and T the kinetic energy, Lagrange's 
 τ being all torque that acts at the joints beside gravity's. p and ∂T/∂q need positions and velocities alone; so does an
 observer of external torque that is built on them (De Luca and Mattone, ICRA 2005).
 
-All vectors are in the base frame and all moments about its origin, so that velocities add up from the base outwards and
+Velocities are in the base frame and all moments about its origin, so that they add up from the base outwards and
 momenta from the tip inwards by cumulated sums. A joint's screw is s_i = (z_i, o_i × z_i); with the momentum h_i of all
-links that it carries p_i = s_i · h_i, and since ∂T/∂q_i = ṡ_i · h_i with ṡ_i = v_i × s_i, one sweep gives both.
+links that it carries p_i = s_i · h_i, and since ∂T/∂q_i = ṡ_i · h_i with ṡ_i = v_i × s_i, one sweep gives both. A
+link's own momentum is its inertia in its bar frame, a constant, times its velocity there; its weight is the same
+inertia times the acceleration of gravity.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from gcomp.arm.arm import Arm, bar_frames
+from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array, Mask
 
@@ -26,98 +27,117 @@ INERTIAL = 10
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
+def _by_parameter() -> Array:
+    """Inertia (10, 6, 6) of each parameter alone: velocity (angular, linear) to momentum (angular, linear)."""
+    out = np.zeros((INERTIAL, 6, 6))
+    out[0, 3:, 3:] = np.eye(3)
+    for k, unit in enumerate(np.eye(3), start=1):
+        out[k, :3, 3:] = np.cross(unit, np.eye(3)).T
+        out[k, 3:, :3] = -out[k, :3, 3:]
+    for k, (i, j) in enumerate(PAIRS, start=4):
+        out[k, i, j] = out[k, j, i] = 1.0
+    return out
+
+
+BY_PARAMETER = _by_parameter()
+BY_VELOCITY = BY_PARAMETER.transpose(2, 1, 0).reshape(6, 6 * INERTIAL)
+"""The same from velocities (6) to the derivatives of the momentum by the parameters (6, 10)."""
+
+
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
     """An arm of n joints at K positions and velocities."""
 
-    gravity: Array
-    """(3,) [m/s²]."""
-    rotation: Array
-    """Axes of the bar frames (K, n, 3, 3)."""
+    to_link: Array
+    """Velocities (angular, linear at the base's origin) in the base frame to those of each link's origin in its bar
+    frame (K, n, 6, 6); its transpose brings forces back."""
     origin: Array
     """Origins of the bar frames (K, n, 3) [m]."""
+    moves: Array
+    """Of each link, in its bar frame: velocity, and gravity as an acceleration (K, n, 6, 2) [rad/s, m/s; m/s²]."""
     screw: Array
     """(K, n, 6): axis, and its moment about the base [m]."""
-    rate: Array
-    """Velocity of each link (K, n, 6): angular [rad/s], and of the point that is in the base's origin [m/s]."""
     screw_rate: Array
     """ṡ (K, n, 6)."""
 
-    def part(self, rows: slice | Mask) -> "RigidMotion":
-        found = (each[rows] for each in (self.rotation, self.origin, self.screw, self.rate, self.screw_rate))
-        return RigidMotion(self.gravity, *found)
+    @property
+    def rotation(self) -> Array:
+        """Axes of the bar frames (K, n, 3, 3)."""
+        return self.to_link[..., :3, :3].swapaxes(-1, -2)
 
-    @cached_property
-    def origin_velocity(self) -> Array:
-        """Of each link's origin (K, n, 3) [m/s]."""
-        return self.rate[..., 3:] + _cross(self.rate[..., :3], self.origin)
+    def part(self, rows: slice | Mask) -> "RigidMotion":
+        return RigidMotion(
+            self.to_link[rows], self.origin[rows], self.moves[rows], self.screw[rows], self.screw_rate[rows]
+        )
+
+    @staticmethod
+    def joined(parts: "list[RigidMotion]") -> "RigidMotion":
+        return RigidMotion(
+            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RigidMotion))
+        )
 
 
 def rigid_motion(arm: Arm, q: Array, velocity: Array) -> RigidMotion:
     """At positions (K, n) [rad] and velocities (K, n) [rad/s]."""
-    rotation = bar_frames(arm, q).rotation
-    steps = np.einsum("knij,nj->kni", rotation, arm.span)
-    origin = np.zeros_like(steps)
-    np.cumsum(steps[:, :-1], axis=1, out=origin[:, 1:])
-    axis = rotation[..., 2]
-    screw = np.concatenate([axis, _cross(origin, axis)], axis=-1)
-    rate = np.cumsum(screw * velocity[..., None], axis=1)
-    turning, moving = rate[..., :3], rate[..., 3:]
-    screw_rate = np.concatenate(
-        [_cross(turning, axis), _cross(turning, screw[..., 3:]) + _cross(moving, axis)], axis=-1
-    )
-    return RigidMotion(arm.gravity, rotation, origin, screw, rate, screw_rate)
+    count, n = q.shape
+    turn = _axes(arm, q)
+    origin = np.zeros((count, n, 3))
+    np.cumsum((turn @ arm.span[:, :, None])[:, :-1, :, 0], axis=1, out=origin[:, 1:])
+    to_link = np.zeros((count, n, 6, 6))
+    to_link[..., :3, :3] = to_link[..., 3:, 3:] = along = turn.swapaxes(-1, -2)
+    to_link[..., 3:, :3] = _cross(origin[:, :, None], along)
+    x, y, screw = (to_link[..., k::3, :3].reshape(count, n, 6) for k in range(3))
+    moves = np.empty((count, n, 6, 2))
+    np.cumsum(screw * velocity[..., None], axis=1, out=moves[..., 0])
+    moves[..., :3, 1], moves[..., 3:, 1] = 0.0, arm.gravity
+    moves = to_link @ moves
+    screw_rate = moves[..., 1, :1] * x - moves[..., 0, :1] * y
+    screw_rate[..., 3:] += moves[..., 4, :1] * x[..., :3] - moves[..., 3, :1] * y[..., :3]
+    return RigidMotion(to_link, origin, moves, screw, screw_rate)
 
 
-def momentum_terms(motion: RigidMotion, inertial: Array) -> tuple[Array, Array]:
-    """(p [N·m·s], ∂T/∂q − g [N·m]) (K, n) each, for links of inertial parameters (n, 10)."""
-    turn, origin = motion.rotation, motion.origin
-    mass = inertial[:, 0, None]
-    moment = np.einsum("knij,nj->kni", turn, inertial[:, 1:4])
-    omega, velocity = motion.rate[..., :3], motion.origin_velocity
-    about = inertial[:, 4:][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    own = np.einsum("knji,knj->kni", turn, omega)
-    spin = np.einsum("knij,knj->kni", turn, np.einsum("nij,knj->kni", about, own))
-    linear = mass * velocity + _cross(omega, moment)
-    angular = spin + _cross(moment, velocity) + _cross(origin, linear)
-    weight = np.concatenate([_cross(mass * origin + moment, motion.gravity), mass * motion.gravity + 0 * origin], -1)
-    carried = _inwards(np.concatenate([angular, linear], axis=-1))
-    momentum = (motion.screw * carried).sum(-1)
-    return momentum, (motion.screw_rate * carried).sum(-1) + (motion.screw * _inwards(weight)).sum(-1)
+def _axes(arm: Arm, q: Array) -> Array:
+    """Rotations of `bar_frames`, (K, n, 3, 3), with as few steps as few poses need."""
+    cos, sin = np.cos(q + arm.theta_offset), np.sin(q + arm.theta_offset)
+    twist = np.append(0.0, arm.alpha[:-1])
+    ca, sa = np.cos(twist), np.sin(twist)
+    turn = np.empty((*q.shape, 3, 3))
+    turn[..., 0, 0], turn[..., 1, 0], turn[..., 2, 0] = cos, ca * sin, sa * sin
+    turn[..., 0, 1], turn[..., 1, 1], turn[..., 2, 1] = -sin, ca * cos, sa * cos
+    turn[..., 0, 2], turn[..., 1, 2], turn[..., 2, 2] = 0.0, -sa, ca
+    for i in range(1, arm.n):
+        turn[:, i] = turn[:, i - 1] @ turn[:, i]
+    return turn
+
+
+def momentum_terms(motion: RigidMotion, inertial: Array) -> tuple[Array, Array, Array]:
+    """(p [N·m·s], ∂T/∂q − g [N·m], g [N·m]) (K, n) each, for links of inertial parameters (n, 10)."""
+    inertia = (inertial @ BY_PARAMETER.reshape(INERTIAL, 36)).reshape(-1, 6, 6)
+    carried = _inwards(motion.to_link.swapaxes(-1, -2) @ (inertia @ motion.moves))
+    by_screw = (motion.screw[..., None, :] @ carried)[..., 0, :]
+    gravity = -by_screw[..., 1]
+    return by_screw[..., 0], (motion.screw_rate * carried[..., 0]).sum(-1) - gravity, gravity
 
 
 def momentum_regressors(motion: RigidMotion) -> tuple[Array, Array]:
-    """Derivatives of `momentum_terms` by all inertial parameters, (K, n, 10 n) each."""
+    """Derivatives of the first two of `momentum_terms` by all inertial parameters, (K, n, 10 n) each."""
     count, n = motion.origin.shape[:2]
-    turn, origin, omega, velocity = motion.rotation, motion.origin, motion.rate[..., :3], motion.origin_velocity
-    momentum, weight = np.zeros((2, count, n, INERTIAL, 6))
-    momentum[..., 0, 3:], weight[..., 0, 3:] = velocity, motion.gravity
-    weight[..., 0, :3] = _cross(origin, motion.gravity)
-    momentum[..., 0, :3] = _cross(origin, velocity)
-    for k in range(3):
-        along = turn[..., k]
-        linear = _cross(omega, along)
-        momentum[..., 1 + k, 3:] = linear
-        momentum[..., 1 + k, :3] = _cross(origin, linear) + _cross(along, velocity)
-        weight[..., 1 + k, :3] = _cross(along, motion.gravity)
-    own = np.einsum("knji,knj->kni", turn, omega)
-    for column, (i, j) in enumerate(PAIRS, start=4):
-        spin = turn[..., i] * own[..., j, None]
-        momentum[..., column, :3] = spin if i == j else spin + turn[..., j] * own[..., i, None]
-    carries = np.tri(n).T[None, :, :, None]
-    by_momentum = np.einsum("kic,kjpc->kijp", motion.screw, momentum, optimize=True) * carries
-    by_rate = np.einsum("kic,kjpc->kijp", motion.screw_rate, momentum, optimize=True)
-    by_rate = (by_rate + np.einsum("kic,kjpc->kijp", motion.screw, weight, optimize=True)) * carries
-    return by_momentum.reshape(count, n, -1), by_rate.reshape(count, n, -1)
+    own = motion.moves.swapaxes(-1, -2) @ BY_VELOCITY
+    own = own.reshape(count, n, 2, 6, INERTIAL).transpose(0, 1, 3, 2, 4).reshape(count, n, 6, 2 * INERTIAL)
+    base = (motion.to_link.swapaxes(-1, -2) @ own).reshape(count, n, 6, 2, INERTIAL)
+    momentum, weight = base.transpose(3, 0, 2, 1, 4).reshape(2, count, 6, n * INERTIAL)
+    carries = np.arange(n)[:, None] <= np.arange(n * INERTIAL) // INERTIAL
+    by_momentum = (motion.screw @ momentum) * carries
+    return by_momentum, (motion.screw_rate @ momentum + motion.screw @ weight) * carries
 
 
 def jacobian(motion: RigidMotion, link: int, point: Array) -> Array:
     """(K, 6, n): force and moment at a point (3,) of a link's bar frame [m], base axes, to torques by its transpose."""
-    at = motion.origin[:, link] + np.einsum("kij,j->ki", motion.rotation[:, link], point)
-    axis = motion.screw[:, : link + 1, :3]
+    at = motion.origin[:, link] + motion.rotation[:, link] @ point
+    screw = motion.screw[:, : link + 1]
     out = np.zeros((len(at), 6, motion.screw.shape[1]))
-    out[:, :3, : link + 1] = np.swapaxes(_cross(axis, at[:, None] - motion.origin[:, : link + 1]), 1, 2)
-    out[:, 3:, : link + 1] = np.swapaxes(axis, 1, 2)
+    out[:, :3, : link + 1] = (_cross(screw[..., :3], at[:, None]) + screw[..., 3:]).swapaxes(1, 2)
+    out[:, 3:, : link + 1] = screw[..., :3].swapaxes(1, 2)
     return out
 
 
@@ -156,4 +176,8 @@ def _cross(a: Array, b: Array) -> Array:
     """Cross product along the last axis; numpy's own is several times slower on short arrays."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = ay * bz - az * by
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
+    return out

@@ -31,13 +31,16 @@ class Wrench:
     """(S, 3) [N]."""
 
 
-def wrench(motion: RigidMotion, link: int, point: Array, external: Array, std: Array, correlation: Array) -> Wrench:
-    """From external torques (S, n) with their standard deviations and correlation, at a point of a link's bar frame."""
+def wrench(motion: RigidMotion, link: int, point: Array, external: Array, std: Array, precision: Array) -> Wrench:
+    """At a point of a link's bar frame, from external torques (S, n), their standard deviations and the inverse of
+    their correlation."""
     scale = np.array([1.0] * 3 + [LEVER] * 3)
     full = jacobian(motion, link, point) / scale[:, None]
-    inverse = np.linalg.inv(correlation) / (std[:, :, None] * std[:, None, :])
-    value, covariance, determined = _least_squares(full, inverse, external)
-    force, force_covariance, seen = _least_squares(full[:, :3], inverse, external)
+    inverse = precision / (std[:, :, None] * std[:, None, :])
+    weighted = full @ inverse
+    information, torque = weighted @ full.swapaxes(1, 2), weighted @ external[..., None]
+    value, covariance, determined = _least_squares(information, torque)
+    force, force_covariance, seen = _least_squares(information[:, :3, :3], torque[:, :3])
     force_std = np.sqrt(np.diagonal(force_covariance, axis1=1, axis2=2))
     return Wrench(
         np.where(determined, value / scale, np.nan), covariance / np.outer(scale, scale), determined,
@@ -45,16 +48,14 @@ def wrench(motion: RigidMotion, link: int, point: Array, external: Array, std: A
     )  # fmt: skip
 
 
-def _least_squares(pull: Array, inverse: Array, external: Array) -> tuple[Array, Array, Mask]:
+def _least_squares(information: Array, torque: Array) -> tuple[Array, Array, Mask]:
     """Values (S, k), covariance (S, k, k), and which axes have no share in directions that are not determined."""
-    information = pull @ inverse @ np.swapaxes(pull, 1, 2)
     values, vectors = np.linalg.eigh(information)
     kept = values > values[:, -1:] / WIDEST**2
     inverted = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    covariance = (vectors * inverted[:, None]) @ np.swapaxes(vectors, 1, 2)
-    found = np.einsum("sij,sj->si", covariance, np.einsum("sij,sjk,sk->si", pull, inverse, external))
+    covariance = (vectors * inverted[:, None]) @ vectors.swapaxes(1, 2)
     lost = ((vectors**2) * ~kept[:, None]).sum(-1)
-    return found, covariance, lost < 1e-3
+    return (covariance @ torque)[..., 0], covariance, lost < 1e-3
 
 
 def smallest_force(
@@ -62,8 +63,8 @@ def smallest_force(
 ) -> tuple[Array, Array]:
     """Force at a point that is found in 95 % [N], in the direction felt best and in the one felt worst, (S,) each."""
     pull = jacobian(motion, link, point)[:, :3]
-    inverse = np.linalg.inv(spread.correlation) / (std[:, :, None] * std[:, None, :])
-    values = np.linalg.eigvalsh(pull @ inverse @ np.swapaxes(pull, 1, 2))
+    inverse = spread.precision / (std[:, :, None] * std[:, None, :])
+    values = np.linalg.eigvalsh(pull @ inverse @ pull.swapaxes(1, 2))
     needed = np.sqrt(limit) + ONE_SIDED_95
     with np.errstate(divide="ignore"):
         best, worst = needed / np.sqrt(np.maximum(values[:, -1], 0.0)), needed / np.sqrt(np.maximum(values[:, 0], 0.0))
@@ -75,6 +76,6 @@ def force_found(
 ) -> Array:
     """Size of a force along a direction (3,) of the base that is found in 95 % [N], (S,)."""
     pull = np.einsum("skn,k->sn", jacobian(motion, link, point)[:, :3], direction)
-    inverse = np.linalg.inv(detector.model.sudden.correlation) / (std[:, :, None] * std[:, None, :])
+    inverse = detector.model.sudden.precision / (std[:, :, None] * std[:, None, :])
     felt = np.sqrt(np.einsum("si,sij,sj->s", pull, inverse, pull))
     return np.asarray((np.sqrt(detector.sudden_limit) + ONE_SIDED_95) / np.maximum(felt, 1e-12))

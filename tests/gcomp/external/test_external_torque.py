@@ -8,7 +8,7 @@ from gcomp.arm.inertials import inertial_of
 from gcomp.arm.load import bar_inertials
 from gcomp.external.contact import ContactDetector, threshold
 from gcomp.external.external_model import BEGINNING, ROWS_RATE, from_records, variance_components
-from gcomp.external.filtered_rows import BANDWIDTH, RowFilter
+from gcomp.external.filtered_rows import BANDWIDTH, RowFilter, faded_sums
 from gcomp.external.rigid_motion import jacobian, momentum_terms, rigid_motion
 from gcomp.external.wrench import smallest_force, wrench
 from gcomp.gravity.torque import gravity_torque
@@ -34,6 +34,12 @@ def test_rows_do_not_depend_on_how_samples_arrive(placed):
     parts = [made.rows(work.part(slice(begin, begin + 7))) for begin in range(0, len(work), 7)]
     for name in ("torque", "links", "joints", "by_link", "state"):
         assert np.concatenate([getattr(part, name) for part in parts]) == pytest.approx(getattr(whole, name), abs=1e-9)
+
+
+def test_sums_that_fade_are_those_of_a_recursive_filter():
+    values, before = np.random.default_rng(2).normal(size=(100, 3, 2)), np.ones((3, 2))
+    wanted, _ = lfilter([1.0], [1.0, -0.9], values, axis=0, zi=0.9 * before[None])
+    assert faded_sums(values, 0.9, before) == pytest.approx(wanted, abs=1e-12)
 
 
 def judged(learned, work, external=0.0):

@@ -29,7 +29,7 @@ def test_momentum_changes_as_lagrange_s_equation_says(placed):
     after, before = (
         momentum_terms(rigid_motion(arm, q + h * v + h * h / 2 * a, v + h * a), links)[0] for h in (step, -step)
     )
-    _, rest = momentum_terms(rigid_motion(arm, q, v), links)
+    _, rest, _ = momentum_terms(rigid_motion(arm, q, v), links)
     assert (after - before) / (2 * step) - rest == pytest.approx(torque, abs=1e-6)
 
 
@@ -37,7 +37,7 @@ def test_the_terms_are_linear_in_the_links_parameters(placed):
     arm, links = placed.arm.arm, bar_inertials(placed)
     q, v, _ = moves(arm.n)
     motion = rigid_motion(arm, q, v)
-    for by_parameter, term in zip(momentum_regressors(motion), momentum_terms(motion, links), strict=True):
+    for by_parameter, term in zip(momentum_regressors(motion), momentum_terms(motion, links)[:2], strict=True):
         assert by_parameter @ links.ravel() == pytest.approx(term, abs=1e-12)
 
 
