@@ -35,6 +35,13 @@ def external(
     out: Annotated[
         Path | None, typer.Option(help="Write torques, bounds and wrench over time: .csv, or .mcap for ROS 2.")
     ] = None,
+    learned: Annotated[
+        Path | None,
+        typer.Option(
+            help="Keep what is learned from --baseline in this file (.npz); without --baseline, take it from there. "
+            "The daemon reads external.npz of its state directory."
+        ),
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
     ] = None,
@@ -62,20 +69,26 @@ def external(
     from armlink.recording.files import load_recordings
     from calib.external.arm_model import listener_of
     from calib.external.force_map import draw_map, smallest_forces
+    from calib.external.learned import Learned, load_learned, save_learned
     from calib.external.listening import listen
     from calib.external.tables import answer_of, save_heard
 
-    if not recordings and picture is None:
+    if not recordings and picture is None and not (learned and baseline):
         raise BadInput("give recordings to judge, or --picture FILE.svg for the smallest force that is felt")
     per_hour = parse_rate(false_alarms)
     records = _records(arm, base, tip, tool, store)
     judged = {label: each for path in recordings or [] for label, each in load_recordings(path, stated).items()}
     free = [each for path in baseline or [] for each in load_recordings(path, stated).values()]
-    listener = listener_of(records, free, list(judged.values()))
     place = parse_frame(frame, records)
+    if learned is not None and not free:
+        listener = load_learned(learned, records).listener
+    else:
+        listener = listener_of(records, free, list(judged.values()))
+        if learned is not None:
+            save_learned(learned, Learned(listener, place, per_hour))
     console, answers = results(json_file), []
     every: list[Heard] = []
-    if not free:
+    if not free and learned is None:
         PlainConsole().print(
             "the bounds follow from the records alone, and were not checked on work of the arm: give recordings "
             "without contact as --baseline",

@@ -5,6 +5,7 @@ Each part holds its own state and calls only parts further down:
     ActiveRecords          records in force, and whether the controllers hold them
     Observation            one observer against one pair of records: ObserverFeed
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
+    ExternalTorque         what neither arm nor friction explains, and contacts
     DailyDiagnosis         the day's busiest minute, diagnosed by a process of its own; what wears
     PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings, BusiestMinute
     BusJobs                work that waits for bus or record store, one job at a time
@@ -24,6 +25,7 @@ from armlink.loop.messages import Batch, Down, Progress, Stopped, Up
 from calib.daemon.environment import CLOSING_SECONDS, BusJobs, Environment
 from calib.daemon.observation.active_records import ActiveRecords
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
+from calib.daemon.observation.external_torque import ExternalTorque
 from calib.daemon.observation.observation import ActiveObservation, ObserverFeed, ObserverStorage
 from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
@@ -76,6 +78,7 @@ class Service:
         self.diagnosis = DailyDiagnosis(
             self.configuration, environment, self.events, self.busiest, directory / "diagnosis"
         )
+        self.external = ExternalTorque(self.configuration, environment, directory / "external.npz")
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
             self.configuration, store, self.arm_state, self.journal, self.events, self.jobs, monotonic
@@ -114,6 +117,10 @@ class Service:
                 self.busiest.append(message)
             self.tours.heard(message)
             if self.records.observation is not None:
+                if self.jobs.busy:
+                    self.external.interrupt()
+                else:
+                    self.external.take(message, self.records.observation.feed)
                 self.records.observation.handle(message)
         elif isinstance(message, Up):
             self.arm_state.up()
@@ -156,6 +163,9 @@ class Service:
         evidence = {"policy": settings.policy}
         self.events.say("configuration", None, "the configuration was reloaded", evidence)
         self.records.load()
+        if self.records.observation is not None:
+            feed = self.records.observation.feed
+            self.external.renew(feed.calibration, feed.gravity)
 
     def save(self, history: bool = False) -> None:
         """Save the observer's state now and, if asked for, a point of history."""
@@ -211,6 +221,7 @@ class Service:
         )
         if before is not None:
             observation.last_accepted = before.last_accepted
+        self.external.renew(feed.calibration, feed.gravity)
         return observation
 
 

@@ -15,12 +15,16 @@ from calib.arm.kinematics import gcomp_arm, model_arm, model_chain
 from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
+from calib.daemon.state.arm_state import LONGEST_PAUSE
 from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from calib.external.live import LiveExternal
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
+from gcomp.external.contact import ContactEvent
+from gcomp.external.external_model import NORMAL_95
 
 
 class ServiceView:
@@ -76,8 +80,56 @@ class ServiceView:
             states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
             ages = batch.age + arm_state.late
         (torque,), (model,) = self._torques(position[None], torque[None])
-        columns = zip(names, position, torque, model, torque - model, temperature, states, ages, strict=True)
+        external, bound = self._external()
+        columns = zip(
+            names, position, torque, model, torque - model, temperature, states, ages, external, bound, strict=True
+        )
         return tuple(view.JointNow(**dict(zip(view.JointNow.model_fields, column, strict=True))) for column in columns)
+
+    def _external(self) -> tuple[Array, Array]:
+        """External torque and its 95 % bound (n,) [N·m]; NaN without."""
+        live = self._service.external.live
+        if live is None or live.row is None or self._age(live.row.t) > LONGEST_PAUSE:
+            unknown = np.full(len(self._service.configuration.names), math.nan)
+            return unknown, unknown
+        return live.row.external, NORMAL_95 * live.row.std
+
+    def _age(self, t: float) -> float:
+        return max(self._service.environment.monotonic() - t, 0.0)
+
+    def external(self) -> view.ExternalNow:
+        part, names = self._service.external, self._service.configuration.names
+        events = tuple(_external_event(time, event, names) for time, event in part.events)
+        if part.live is None:
+            return view.ExternalNow(reason=part.reason, events=events)
+        torque, bound = self._external()
+        row, learned = part.live.row, part.live.learned
+        return view.ExternalNow(
+            reason="" if row is not None else "no row of samples has come yet",
+            age_s=None if row is None else self._age(row.t),
+            baseline_s=learned.listener.model.seconds,
+            false_alarms_per_hour=learned.per_hour,
+            torque=tuple(torque.tolist()),
+            bound=tuple(bound.tolist()),
+            wrench=self._wrench(part.live),
+            load=part.live.load,
+            events=events,
+        )
+
+    def _wrench(self, live: LiveExternal) -> view.ExternalWrench | None:
+        told, frame = live.wrench(), live.learned.frame
+        if told is None:
+            return None
+        value, std = told.value[0], np.sqrt(np.diagonal(told.covariance[0]))
+        std = np.where(told.determined[0], std, math.nan)
+        return view.ExternalWrench(
+            joint=self._service.configuration.names[frame.link],
+            point=tuple(frame.point.tolist()),
+            force=tuple(value[:3].tolist()),
+            force_std=tuple(std[:3].tolist()),
+            moment=tuple(value[3:].tolist()),
+            moment_std=tuple(std[3:].tolist()),
+        )
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""
@@ -184,6 +236,18 @@ class ServiceView:
                 counted |= {"rate_hz": 0.0, "load": 0.0}
         fault = arm_state.fault or arm_state.silent or None
         return view.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
+
+
+def _external_event(time: datetime, event: ContactEvent, names: tuple[str, ...]) -> view.ExternalEvent:
+    return view.ExternalEvent(
+        time=time,
+        kind=event.kind,
+        joints=tuple(names[j] for j in event.joints),
+        link=names[event.link],
+        probability=event.probability,
+        least_force=event.least_force,
+        mass=event.mass,
+    )
 
 
 def _point(

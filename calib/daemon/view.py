@@ -120,6 +120,10 @@ class JointNow(Answer):
     """State of the drive in words; "unknown" before its first reading."""
     sample_age_s: Number
     """Time since position and torque last arrived; None if they never did."""
+    external_torque: Number = None
+    """What the surroundings push this joint with [N·m]; None where GET /api/external says why not."""
+    external_bound: Number = None
+    """Half width of its 95 % interval [N·m]."""
 
 
 class JointEstimate(Answer):
@@ -143,6 +147,61 @@ class JointEstimate(Answer):
     """Smallest change of offset that would be noticed now [N·m]."""
     limit_rests: int | None = None
     """Rests at other poses after which changes of this size are noticed; larger ones are sooner."""
+
+
+class ExternalWrench(Answer):
+    """Force and moment at a point of a link, in the axes of the base; None along axes that the joints do not show."""
+
+    joint: str
+    """With whose frame the point turns."""
+    point: Vector
+    """In that frame [m]."""
+    force: tuple[Number, Number, Number]
+    """[N]"""
+    force_std: tuple[Number, Number, Number]
+    moment: tuple[Number, Number, Number]
+    """[N·m]"""
+    moment_std: tuple[Number, Number, Number]
+
+
+class ExternalEvent(Answer):
+    """A contact, or a load that was taken up or put down."""
+
+    time: AwareDatetime
+    """When it was decided."""
+    kind: str
+    """contact, load, load put down, contact or load."""
+    joints: tuple[str, ...]
+    """Those whose torque it changes beyond their bound, the surest first."""
+    link: str
+    """Joint that turns the likeliest link."""
+    probability: Number
+    """Of that link, given a contact."""
+    least_force: Number
+    """95 % lower bound of the force of a contact [N]."""
+    mass: Number
+    """Of a load [kg]; negative if put down."""
+
+
+class ExternalNow(Answer):
+    """GET /api/external: what neither arm nor tool nor friction explains."""
+
+    reason: str
+    """Why there is none, in one line; empty if there is."""
+    age_s: Number = None
+    """Time since the newest row; None before the first."""
+    baseline_s: Number = None
+    """Work without contact that the bounds rest on [s]."""
+    false_alarms_per_hour: Number = None
+    torque: tuple[Number, ...] = ()
+    """What the surroundings push the joints with, base to tip [N·m]."""
+    bound: tuple[Number, ...] = ()
+    """Half widths of the 95 % intervals [N·m]."""
+    wrench: ExternalWrench | None = None
+    load: Number = None
+    """Mass that the arm was found to have taken up [kg]."""
+    events: tuple[ExternalEvent, ...] = ()
+    """The newest ones, oldest first."""
 
 
 class EventRecord(Answer):
@@ -251,6 +310,7 @@ class Overview(Answer):
     status: Status
     joints: tuple[JointNow, ...]
     estimates: tuple[JointEstimate, ...]
+    external: ExternalNow
     proposals: tuple[Proposal, ...]
     events: tuple[EventRecord, ...]
     """The newest, oldest first."""
@@ -339,6 +399,10 @@ class DaemonView(Protocol):
 
     def joints(self) -> tuple[JointNow, ...]:
         """Every joint as of the newest snapshot, base to tip."""
+        ...
+
+    def external(self) -> ExternalNow:
+        """External torque as of the newest row."""
         ...
 
     def window(self, seconds: float, most: int) -> Window:

@@ -15,6 +15,7 @@ from calib.daemon.view import (
     DaemonView,
     DrawnArm,
     EventRecord,
+    ExternalNow,
     HistoryPoint,
     JointEstimate,
     JointNow,
@@ -109,6 +110,11 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         """Latest readings of every joint, base to tip."""
         return view.joints()
 
+    @router.get("/api/external", tags=["now"])
+    async def external() -> ExternalNow:
+        """Torque, force and moment that neither arm nor friction explains, with 95 % bounds, and contacts."""
+        return view.external()
+
     @router.get("/api/arm", responses=NO_SUCH, tags=["now"])
     async def arm(owner: Owner) -> DrawnArm:
         """The arm's shape, to draw it at any joint positions."""
@@ -128,6 +134,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
             status=status,
             joints=view.joints(),
             estimates=view.estimates(),
+            external=view.external(),
             proposals=view.proposals(),
             events=(),
             history=(),

@@ -84,6 +84,21 @@ def test_a_push_is_found_and_free_motion_is_quiet(workplace, capsys):
     assert told == pytest.approx(8.0, abs=1.5)
 
 
+def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    assert (
+        run(["external", "arm.xml", "--baseline", "free_1.csv", "--learned", "kept.npz", "--false-alarms", "2/h"]) == 0
+    )
+    answers = []
+    for words in ("--baseline free_1.csv", "--learned kept.npz"):
+        capsys.readouterr()
+        assert run(["external", "arm.xml", "quiet.csv", *words.split(), "--json", "-"]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[0] == answers[1]
+    assert run(["external", "arm.xml", "quiet.csv", "--learned", "quiet.csv"]) == 2
+    assert "quiet.csv: cannot be read" in capsys.readouterr().err
+
+
 def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     monkeypatch.chdir(workplace)
     joints = [

@@ -26,10 +26,12 @@ function row(name) {
     cells[kind].dataset.label = label;
     line.append(cells[kind]);
   }
+  cells.external = cell("external");
+  cells.external.dataset.label = "External [N·m, 95 %]";
   cells.temperature = cell("temperature");
   cells.temperature.dataset.label = "Temperature [°C]";
   cells.drive = make("td", { className: "drive" });
-  line.append(cells.temperature, cells.drive);
+  line.append(cells.external, cells.temperature, cells.drive);
   by("joints").tBodies[0].append(line);
   rows.set(name, { line, cells });
   return rows.get(name);
@@ -46,9 +48,12 @@ export function showJoints(joints, moving = false) {
   const largest = Math.max(...joints.map((joint) => Math.abs(joint.residual ?? 0)), 0.1);
   scale = largest > scale || largest < scale / 4 ? nice(largest) : scale;
   put(by("bar-scale"), `±${scale} N·m`);
+  by("joints").classList.toggle("untouched", joints.every((joint) => (joint.external_bound ?? null) === null));
   by("joints").classList.toggle("cold", joints.every((joint) => joint.temperature === null));
   for (const joint of joints) {
     const { cells } = row(joint.joint);
+    const bound = joint.external_bound ?? 0;
+    interval(cells.external, joint.external_torque ?? null, bound / 1.96, 2, Math.abs(joint.external_torque ?? 0) > bound);
     put(cells.temperature, number(joint.temperature, 0));
     put(cells.position, number(joint.position, 3));
     put(cells.torque, number(joint.torque, 2));
@@ -69,6 +74,8 @@ function interval(cell, value, std, digits, off) {
   const around = std > 0 ? ` ± ${number(1.96 * std, digits)}` : ""; // 0: unchanged, because only the other one drifts
   cell.replaceChildren(signed(value, digits), make("span", { className: "pm" }, around));
 }
+
+export const showExternal = ({ reason }) => put(by("no-external"), reason && `No external torque: ${reason}.`);
 
 // Summary of the estimates in one line.
 export function verdict(estimates) {

@@ -5,7 +5,7 @@ import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, set
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
 import { initArm, showArm } from "./arm.js";
-import { showEstimates, showJoints, shownScale, verdict } from "./joints.js";
+import { showEstimates, showExternal, showJoints, shownScale, verdict } from "./joints.js";
 import { addSample, drawLive, fetchWindow, initLive, moves } from "./live.js";
 import { fetchProposals, showProposals } from "./proposals.js";
 
@@ -142,6 +142,7 @@ async function start() {
   showStatus();
   showJoints(all.joints);
   showEstimates(all.estimates);
+  showExternal(all.external);
   showProposals(all.proposals);
   setLive(all.estimates, status);
   setHistory(all.history);

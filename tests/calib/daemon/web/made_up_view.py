@@ -109,9 +109,16 @@ class MadeUpView:
                 temperature=31.0 + k,
                 state="operation enabled",
                 sample_age_s=None if self.fault else 0.004,
+                external_torque=0.1 + self.shift * (k == 1),
+                external_bound=0.4,
             )
             for k, name in enumerate(NAMES)
         )
+
+    def external(self) -> view.ExternalNow:
+        joints = self.joints()
+        torque, bound = (tuple(getattr(joint, f"external_{name}") for joint in joints) for name in ("torque", "bound"))
+        return view.ExternalNow(reason="", age_s=0.02, baseline_s=600.0, torque=torque, bound=bound)
 
     def window(self, seconds: float, most: int) -> Window:
         """A swing since the start, of the torques alone if nothing `moves`."""

@@ -214,7 +214,7 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     known = {*described, "/openapi.json", *page_files()}
     assert all(path in known for path in route_paths(app.routes))
     offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
-    reading = {"status", "joints", "estimates", "events", "history_pages", "proposals", "subscribe"}
+    reading = {"status", "joints", "estimates", "external", "events", "history_pages", "proposals", "subscribe"}
     assert offered == reading | {"decisions", "arm", "window"}
     assert decided == {"approve", "reject"}
 
@@ -225,7 +225,8 @@ def route_paths(routes: Any) -> set[str]:
 
 def test_every_route_of_the_contract_is_described_and_typed(server: Served) -> None:
     described = server.client().get("/openapi.json").json()
-    wanted = ("status", "overview", "joints", "arm", "estimates", "events", "history", "window", "proposals", "stream")
+    wanted = ("status", "overview", "joints", "arm", "estimates", "external", "events", "history", "window")
+    wanted += ("proposals", "stream")
     assert {f"/api/{name}" for name in wanted} | {"/metrics"} <= described["paths"].keys()
     for name in wanted[:-1]:
         schema = described["paths"][f"/api/{name}"]["get"]["responses"]["200"]["content"]["application/json"]["schema"]

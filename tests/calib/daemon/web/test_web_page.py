@@ -263,6 +263,7 @@ def test_live_torque_beside_the_model_and_its_window_as_a_recording(
     tick_until("#joints.moving")  # the made-up arm swings
     tick_until("#live-joint_7 svg polyline.torque")
     expect(page.locator("#joints")).to_have_class("moving")
+    expect(page.locator("[data-joint=joint_3] .external")).to_have_text("+0.10 ± 0.40")
     expect(page.locator("#moving")).to_contain_text("when it rests")
     expect(page.locator("#live .chart")).to_have_count(len(NAMES))
     expect(page.locator("#live-joint_1 svg")).to_have_attribute(

@@ -73,7 +73,7 @@ def test_generated_requests_to_a_whole_daemon_find_no_5xx(tmp_path: Path, monkey
 
     with served(begin, tmp_path / "api.sock") as server:
         checked = check_all(server, SETTINGS)
-    reading = ("status", "overview", "joints", "estimates", "events", "history", "proposals", "arm")
+    reading = ("status", "overview", "joints", "estimates", "external", "events", "history", "proposals", "arm")
     wanted = {f"GET /api/{name}" for name in reading}
     decisions = {f"POST /api/proposals/{{id}}/{verb}" for verb in ("approve", "reject")}
     wanted |= {f"GET /api/window{suffix}" for suffix in ("", ".csv", ".mcap")}

@@ -82,7 +82,7 @@ def test_over_tcp_everything_but_the_page_needs_the_token(server: Served, header
     client = server.tcp(token=None)
     headers = {} if header is None else {"Authorization": header.encode("latin-1")}
     paths = ["status", "overview", "joints", "estimates", "events", "history", "proposals", "stream", "report", "arm"]
-    paths += ["window", "window.csv", "window.mcap"]
+    paths += ["external", "window", "window.csv", "window.mcap"]
     for path in [*(f"/api/{path}" for path in paths), "/metrics", "/openapi.json", "/nothing"]:
         answer = client.get(path, headers=headers)
         assert (path, answer.status_code) == (path, 401)
