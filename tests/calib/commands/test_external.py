@@ -105,7 +105,7 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     out = capsys.readouterr()
     answer = json.loads(out.out)
     assert answer["baseline_s"] == 0.0
-    assert "by the records alone" in out.err
+    assert "from the records alone" in out.err
     assert Path("felt.svg").read_text().startswith("<svg")
 
 
