@@ -49,10 +49,9 @@ CHANNELS = ("gain", "offset")
 ALARM_THRESHOLD = 12.0
 """Log-likelihood ratio of an alarm (docs/theory.md, section 6): false in one of 1e4 rows of a seven-joint arm, which
 only starts a test."""
-DOUBT = 8.0
+DOUBT = 4.0
 """An alarm is one at once if its log-likelihood ratio is this many times larger than needed, where the model's error is
-all there is beside it; what is smaller is left to the audits. In an hour of quiet work of an arm with hysteresis the
-ratio reached 5 times (tests/campaigns/observer_arms.py --levels 3 --first 700 --draws 1 --only quiet)."""
+all there is beside it; what is smaller is left to the audits."""
 NOISE_MEMORY = 200
 """Rows that the measured standard deviation is averaged over: known within 5 % by then."""
 STEADY, CHANCE = 8.0, 3.0
