@@ -228,15 +228,13 @@ class GravityBelief:
         } | self._reference.save()
 
     def restore(self, values: dict[str, Any]) -> None:
-        """States of before the discrepancy have no level and no reference rows: those begin again."""
+        """Older states have no level, or no reference rows: those begin again."""
         size, n, saved = self.beta.size, self.arm.n, values.get("level")
         self.beta = as_array("beta", values["beta"], (size,))
         self._factor = as_array("factor", values["factor"], (size, None))
         self._tool = as_array("tool", np.reshape(values.get("tool", []), (size, -1)), (size, None))
         self._noise, self.mass = as_array("noise", values.get("noise", np.zeros(n)), (n,)), float(values["mass"])
-        if saved is not None:
-            if "smooth" in saved:  # by earlier versions
-                saved = {**saved, "sizes": [*saved["smooth"], saved["rough"]]}
+        if saved is not None and "sizes" in saved:
             stds = {name: as_array(name, saved[name], np.shape(getattr(self.level, name))) for name in LEVEL_ARRAYS}
             self.level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
         self._reference = restored(self._reference, values)

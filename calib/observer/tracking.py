@@ -13,7 +13,7 @@ import numpy as np
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW
+from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW
 from calib.observer.decision import DriftFinding
 from calib.observer.discrepancy import PLACE_SIZE
 from calib.observer.evidence import DetectionLimits
@@ -85,11 +85,10 @@ class Tracking:
         """Rows taken."""
         self.state: Array = np.tile(UNCHANGED, (n, 1))
         """Gain and offset [N·m] (n, 2)."""
-        self.covariance: Array = np.tile(np.diag(CauseTest.sensor_std**2), (n, 1, 1))
+        self.covariance: Array = np.tile(np.diag([INITIAL_GAIN_STD**2, INITIAL_OFFSET_STD**2]), (n, 1, 1))
         """Of gain and offset (n, 2, 2)."""
         self.accepted = np.zeros(n, dtype=int)
         """Rows that went into each joint's estimate (n,)."""
-        self._window = window
         self._latest: deque[StaticReading] = deque(maxlen=window)
 
     def count(self, row: StaticReading) -> bool:
@@ -116,9 +115,9 @@ class Tracking:
         self._latest.append(row)
         if not self.belief.level.is_known:
             return []
-        latest, times = stack(self._latest, "position"), {each.t for each in self._latest}
+        latest = stack(self._latest, "position")
         before = [each for each in known if (np.abs(latest - each.position).max(axis=1) < PLACE_SIZE).any()]
-        rows = [each for each in before if each.t not in times] + list(self._latest)
+        rows = [each for each in before if each.t < self._latest[0].t] + list(self._latest)
         expected = self.belief.expected(*(stack(rows, name) for name in ("position", "direction", "temperature")))
         residual = stack(rows, "torque") - expected.torque - expected.mean
         covariance = expected.of_joints + self.sigma[:, None, None] ** 2 * np.eye(len(rows))
@@ -150,8 +149,7 @@ class Tracking:
 
     def install(self, finding: DriftFinding) -> None:
         """The finding was written: its joint is as installed, within the finding's uncertainty."""
-        untold = np.diag(finding.covariance) == 0
-        self.restart(finding.joint, np.zeros(2), finding.covariance + np.diag(untold * CauseTest.sensor_std**2))
+        self.restart(finding.joint, np.zeros(2), finding.covariance)
         self.belief.close()
 
     def resume(self) -> None:
@@ -166,7 +164,7 @@ class Tracking:
 
         A change is noticed if it stands out of a window of the longest kind, and rows after it confirm it.
         """
-        belief, window = self.belief, self._window
+        belief, window = self.belief, self._latest.maxlen or 0
         wait = 0 if belief.level.is_known else max(0, window - self.rows)
         if len(rows) >= window:
             test = self.cause_test(rows)
@@ -186,5 +184,5 @@ class Tracking:
         self.state = as_array("state", values["state"], (n, 2))
         self.covariance = as_array("covariance", values["covariance"], (n, 2, 2))
         self.accepted = as_array("accepted", values["accepted"], (n,)).astype(int)
-        self._latest = deque(read_rows(values.get("latest", []), n), maxlen=self._window)
+        self._latest = deque(read_rows(values.get("latest", []), n), maxlen=self._latest.maxlen)
         self.belief = restored(self.belief, values)

@@ -195,14 +195,3 @@ def test_an_observer_restored_while_it_learns_goes_on_the_same() -> None:
     restored = run(True)
     assert restored == run(False)
     assert restored
-
-
-def test_a_level_that_an_earlier_version_saved_is_the_same() -> None:
-    arm = RestArm("sarcos", 3)
-    observer, after = arm.observer(), arm.observer()
-    arm.work(observer, 40)
-    saved = json.loads(json.dumps(observer.save()))
-    *smooth, rough = saved["level"].pop("sizes")
-    saved["level"] |= {"smooth": smooth, "rough": rough}
-    assert after.restore(saved)
-    assert after.save() == observer.save()
