@@ -15,11 +15,10 @@ from calib.observer.config import ObserverConfig, Policy
 
 log = logging.getLogger("armlink.daemon")
 FORMER_THRESHOLDS = frozenset({
-    "agreement", "alarm_gain", "alarm_offset", "alarm_threshold", "audit_rows", "baseline_rows", "common_joints",
-    "discrepancy_share", "drift_gain", "drift_offset", "evidence", "excitation_rows", "excitation_std", "gap_time",
-    "initial_gain_std", "initial_offset_std", "lever_share", "longest_window", "misfit", "new_pose", "noise_memory",
-    "noise_rows", "noise_share", "outlier", "outliers_in_a_row", "patience", "place_memory", "place_rows", "place_size",
-    "places", "position_std", "significance",
+    "agreement", "alarm_threshold", "audit_rows", "common_joints", "discrepancy_share", "drift_gain", "drift_offset",
+    "evidence", "excitation_rows", "excitation_std", "gap_time", "initial_gain_std", "initial_offset_std",
+    "lever_share", "longest_window", "misfit", "new_pose", "noise_memory", "noise_rows", "outlier", "outliers_in_a_row",
+    "patience", "place_memory", "place_rows", "place_size", "places", "significance",
 })  # fmt: skip
 """Keys that arm files of earlier versions may have: constants by now."""
 _WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)

@@ -121,7 +121,7 @@ class JointNow(Answer):
     sample_age_s: Number
     """Time since position and torque last arrived; None if they never did."""
     external_torque: Number = None
-    """What the surroundings push this joint with [N·m]; None where GET /api/external says why not."""
+    """With which the surroundings push this joint [N·m]; None where GET /api/external says why not."""
     external_bound: Number = None
     """Half width of its 95 % interval [N·m]."""
 
@@ -184,7 +184,7 @@ class ExternalEvent(Answer):
 
 
 class ExternalNow(Answer):
-    """GET /api/external: what neither arm nor tool nor friction explains."""
+    """GET /api/external: torque that neither arm nor tool nor friction explains."""
 
     reason: str
     """Why there is none, in one line; empty if there is."""
@@ -194,7 +194,7 @@ class ExternalNow(Answer):
     """Work without contact that the bounds rest on [s]."""
     false_alarms_per_hour: Number = None
     torque: tuple[Number, ...] = ()
-    """What the surroundings push the joints with, base to tip [N·m]."""
+    """With which the surroundings push the joints, base to tip [N·m]."""
     bound: tuple[Number, ...] = ()
     """Half widths of the 95 % intervals [N·m]."""
     wrench: ExternalWrench | None = None

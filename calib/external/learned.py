@@ -1,4 +1,4 @@
-"""What was learned of an arm's own work, in a file: learned once, listened with while the same records are in force."""
+"""An arm's own work, learned once and kept in a file, for as long as the same records are in force."""
 
 import io
 import zipfile
@@ -36,7 +36,8 @@ def save_learned(path: Path, learned: Learned) -> None:
     for spread in SPREADS:
         content |= {f"{spread}_{name}": getattr(getattr(model, spread), name) for name in OF_SPREAD}
     content |= {f"maxima_{k}": each for k, each in enumerate(model.maxima)}
-    content |= {"schema": SCHEMA, "seconds": model.seconds, "channel": listener.channel, "rate": listener.rate}
+    content["schema"] = SCHEMA
+    content |= {"seconds": model.seconds, "channel": listener.channel, "rate": listener.rate}
     content |= {"names": model.arm.names, "records": _ids(listener.records), "per_hour": learned.per_hour}
     content |= {"link": learned.frame.link, "point": learned.frame.point}
     if listener.warm is not None:
@@ -65,7 +66,7 @@ def load_learned(path: Path, records: ArmRecords) -> Learned:
         listener = ArmListener(model, records, str(content["channel"]), float(content["rate"]), content.get("warm"))
         return Learned(listener, WrenchFrame(int(content["link"]), content["point"]), float(content["per_hour"]))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise BadInput(f"{path}: cannot be read as a file of `armlink external --learned`: {error}") from None
+        raise BadInput(f"{path}: cannot be read as what --learned has written: {error}") from None
 
 
 def _ids(records: ArmRecords) -> tuple[str, str]:

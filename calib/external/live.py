@@ -21,7 +21,7 @@ class ExternalRow:
     t: float
     """[s]"""
     external: Array
-    """(n,) [N·m]: what the surroundings push the joints with."""
+    """(n,) [N·m], with which the surroundings push."""
     std: Array
     """(n,) [N·m]."""
     motion: RigidMotion
@@ -40,7 +40,7 @@ class LiveExternal:
         self.restart()
 
     def restart(self) -> None:
-        """What comes next does not follow from what came before."""
+        """The next samples do not follow from those before."""
         model = self.learned.listener.model
         self._filter: RowFilter = model.filter(self.learned.listener.rate)
         self._detector = ContactDetector(model, self.learned.per_hour, self.learned.frame.point)

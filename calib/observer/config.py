@@ -15,8 +15,6 @@ INITIAL_GAIN_STD = 5e-3
 """Standard deviation of a gain just installed: the accuracy asked of a calibration."""
 INITIAL_OFFSET_STD = 0.05
 """Standard deviation of an offset just installed [N·m]: likewise."""
-NOISE_SHARE = 1e-3
-"""Initial standard deviation of one row, as a share of rated torque: half of one sample's noise of 0.2 %."""
 LONGEST_GAP = 0.05
 """A rest or a stretch of motion with samples missing for longer starts again [s]: 12 cycles at 250 Hz."""
 AUDIT_ROWS = 10
@@ -24,7 +22,7 @@ AUDIT_ROWS = 10
 for an alarm."""
 LONGEST_WINDOW = 60
 """Rows kept for an ambiguous test and for the final estimate (§6: gain to 0.03–0.07 % on well-loaded joints); also rows
-that gain and offset are estimated by."""
+that show whether a gain can be told, and poses remembered."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +37,27 @@ class ObserverConfig:
     """Rest before averaging begins [s]: several time constants of the torque sensor's filter."""
     average_time: float = 0.3
     """Averaging time [s]: 75 samples at 250 Hz reduce sensor noise by a factor of nine."""
+    noise_share: float = 1e-3
+    """Initial standard deviation of one row, as a share of rated torque: half of one sample's noise of 0.2 %."""
+    alarm_gain: float = 0.01
+    """Gain change that the CUSUM is tuned to (§6)."""
+    alarm_offset: float = 0.2
+    """Offset change that the CUSUM is tuned to [N·m] (§6)."""
     window: int = 20
     """Rows of one test (§6): with 20 rows 98 % of the verdicts of 200 rows are reached, in 40 s of motion."""
+    baseline_rows: int = 120
+    """Drift-free rows that drift is measured against: gravity model and discrepancy are adapted to them. Three minutes,
+    in which a drift of 0.5 % an hour is 0.03 %."""
+    position_std: float = 1e-3
+    """Standard deviation of a position sensor's zero [rad]; marginalised like the model's error."""
     zero_wander: float = 3e-3
     """Most that a zero moves with temperature (standard deviation), as a share of rated torque: a sensor of class 0.15,
     three times worse than good ones, by 20 K. Where the arm's discrepancy is small, less is assumed."""
     tool_windows: int = 60
     """Consecutive windows that find the same payload until it counts as a tool: half an hour of stops."""
     gain_std: float = 3e-3
-    """A gain is written only if the rows determine it to this standard deviation: 0.3 % (§6)."""
+    """A gain is written, and followed by the filter, only if the rows determine it to this standard deviation: 0.3 %
+    (§6)."""
     offset_std: float = 0.02
     """An offset is written only if its standard deviation is smaller [N·m] (§6)."""
     rest_between_writes: float = 60.0

@@ -13,7 +13,6 @@ from calib.observer.config import ObserverConfig
 from calib.observer.evidence import Verdict
 from gcomp.arrays import Array
 from gcomp.design.sweep_design import MINIMUM_LEVER
-from gcomp.estimate.explanation import distance
 
 AGREEMENT = 13.8
 """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with 2 degrees
@@ -83,11 +82,11 @@ def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int |
 
     If gravity does not load the joint, only the offset is compared. `beside`: a joint that drifts at the same time.
     """
-    for cause in ("drift", "offset"):
-        (a, cov_a), (b, cov_b) = (window.drift(joint, cause, beside) for window in (first, second))
-        if np.isfinite(a).all() and np.isfinite(b).all():
-            break
-    return distance(a - b, cov_a + cov_b) < AGREEMENT
+    (a, cov_a), (b, cov_b) = (window.drift(joint, "drift", beside) for window in (first, second))
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        (a, cov_a), (b, cov_b) = (window.drift(joint, "offset", beside) for window in (first, second))
+        return bool((a - b)[1] ** 2 < AGREEMENT * (cov_a + cov_b)[1, 1])
+    return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < AGREEMENT
 
 
 def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> DriftFinding:
@@ -114,7 +113,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
         refused.append(
             f"the offset is known only to ± {np.sqrt(covariance[1, 1]):.3f} N·m, but ± {offset_std:.3g} N·m is required"
         )
-    if distance(change, covariance) < SIGNIFICANCE**2:
+    if _distance(change, covariance) < SIGNIFICANCE:
         refused.append(f"the change is less than {SIGNIFICANCE:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
         refused.append("the joint was approached from one side only, so friction looks like an offset")
@@ -145,6 +144,13 @@ def _moved_zeros(test: CauseTest, verdict: Verdict, joint: int) -> int:
     return sum(bool(abs(change[1]) >= SIGNIFICANCE * np.sqrt(covariance[1, 1])) for change, covariance in changes)
 
 
+def _distance(change: Array, covariance: Array) -> float:
+    """Length of the change in standard deviations, over the parameters that were estimated."""
+    estimated = np.diag(covariance) > 0
+    part = change[estimated]
+    return float(np.sqrt(part @ np.linalg.solve(covariance[np.ix_(estimated, estimated)], part)))
+
+
 def _joints_alike(test: CauseTest, joint: int) -> int:
     """Number of joints that, each fitted alone, changed their gain by the same factor as this joint within noise."""
     fits = [test.drift(j, "gain") for j in range(test.belief.arm.n)]
@@ -158,7 +164,7 @@ def _joints_alike(test: CauseTest, joint: int) -> int:
 
 @dataclass(frozen=True)
 class Event:
-    """One event. `kind`: alarm, verdict, proposal or undecided."""
+    """One event. `kind`: alarm, outliers, verdict, proposal or undecided."""
 
     t: float
     kind: str

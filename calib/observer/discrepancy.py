@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.config import LONGEST_WINDOW
 from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm
@@ -21,14 +20,12 @@ LOCAL_ANGLE = 0.5
 have one to four periods a turn."""
 WIDE_ANGLE = 1.4
 """Correlation length in all angles at once [rad]: wrong kinematics and sag are products of first harmonics."""
-PLACE_SIZE = 0.2
-"""Correlation length of what is another torque at each place [rad]: a place is a pose that the arm returns to."""
-PARTS = ("local", "wide", "torque", "place")
-"""Parts whose sizes are learned: by a joint's own and its neighbours' angles, by all angles, by torque, of the joint
-itself (a sensor that is not linear) and of the others (crosstalk), and by place."""
+PARTS = ("local", "wide", "torque")
+"""Parts whose sizes are learned: by a joint's own and its neighbours' angles, by all angles, and by torque, of the
+joint itself (a sensor that is not linear) and of the others (crosstalk)."""
 CONSTANT, SLOPE, SIDE = 0.1, 0.1, 0.05
-"""Shares in the variance of each smooth part: of an offset and a gain, which a calibration gets wrong by this much
-where there is discrepancy, and of the side of approach (hysteresis)."""
+"""Shares in the variance of each part: of an offset and a gain, which a calibration gets wrong by this much where there
+is discrepancy, and of the side of approach (hysteresis)."""
 WARM = 20.0
 """Rise of temperature over which a zero moves by the size that is expected of it [K]: a joint that has warmed up."""
 
@@ -83,20 +80,21 @@ class Kernel:
 
     def between(self, a: Points, b: Points) -> Array:
         """Covariance (parts, n, A, B) between two sets of poses, joint by joint, of each part at size 1."""
-        *smooth, place, common = self._shapes(a, b)
-        return np.stack([*((1.0 - CONSTANT - SLOPE - SIDE) * part + common for part in smooth), place])
+        parts, common = self._shapes(a, b)
+        covariance: Array = (1.0 - CONSTANT - SLOPE - SIDE) * np.stack(parts) + common
+        return covariance
 
-    def weighted(self, sizes: Array, a: Points, b: Points) -> Array:
+    def weighted(self, smooth: Array, a: Points, b: Points) -> Array:
         """Covariance (n, A, B) between two sets of poses from the sizes of the parts (parts, n) [N·m]."""
-        *smooth, place, common = self._shapes(a, b)
-        square = (sizes**2)[:, :, None, None]
-        covariance: Array = square[:-1].sum(axis=0) * common + square[-1] * place
-        for size, part in zip((1.0 - CONSTANT - SLOPE - SIDE) * square[:-1], smooth, strict=True):
+        parts, common = self._shapes(a, b)
+        square = (smooth**2)[:, :, None, None]
+        covariance: Array = square.sum(axis=0) * common
+        for size, part in zip((1.0 - CONSTANT - SLOPE - SIDE) * square, parts, strict=True):
             covariance += size * part
         return covariance
 
-    def _shapes(self, a: Points, b: Points) -> tuple[Array, ...]:
-        """The shape of each part, and what the smooth ones have in common, (n, A, B) each."""
+    def _shapes(self, a: Points, b: Points) -> tuple[tuple[Array, ...], Array]:
+        """(The shape of each part, (n, A, B) each; what all parts have in common, (n, A, B))."""
         n = a.position.shape[1]
         away = 1.0 - a.turned @ b.turned.swapaxes(1, 2)
         near = np.exp(away * (-1 / LOCAL_ANGLE**2))
@@ -105,21 +103,19 @@ class Kernel:
         beside[1:] += near[:-1]
         neighbours = np.array([(j > 0) + (j < n - 1) for j in range(n)])
         local = near * (1.0 + beside) / (1.0 + neighbours)[:, None, None]
-        wide, place = (
-            np.broadcast_to(np.exp(-away.sum(axis=0) / angle**2), local.shape) for angle in (WIDE_ANGLE, PLACE_SIZE)
-        )
+        wide = np.exp(-away.sum(axis=0) / WIDE_ANGLE**2)
         slope = a.torque.T[:, :, None] * b.torque.T[:, None, :]
         crosstalk = (slope.sum(axis=0) - slope) / max(n - 1, 1)
         curve = slope * slope * (1 / 6.0 + slope / 30.0)  # E t⁴ = 3, E t⁶ = 15 of a normal t: each half of the part
         side = a.side.T[:, :, None] * b.side.T[:, None, :]
         common = CONSTANT + SLOPE * slope + SIDE * side
-        return local, wide, (crosstalk + curve) / 2, place, common
+        return (local, np.broadcast_to(wide, local.shape), (crosstalk + curve) / 2), common
 
 
 SMALLEST = 0.05
 """Smallest level that is told from none, in standard deviations of one row."""
 SHARES = np.array([0.4, 0.3, 0.2, 0.1])
-"""Shares of the parts (`PARTS`) in the variance, before the first row."""
+"""Shares of the parts (`kernel.PARTS`, then the rough one) in the variance, before the first row."""
 SPREAD_SHARES = 0.7
 """Standard deviation of the logarithm of a part, beside that of the whole."""
 LEAST_SINGULAR_VALUE = 1e-6
@@ -135,8 +131,10 @@ with one, since work is not done at the calibration's poses."""
 class DiscrepancyLevel:
     """Standard deviations of each joint's discrepancy [N·m]."""
 
-    sizes: Array
-    """Of its parts (`PARTS`, n)."""
+    smooth: Array
+    """Of the parts that are correlated over poses (`kernel.PARTS`, n)."""
+    rough: Array
+    """Of the part that is another one at each pose (n,)."""
     before: Array
     """Of all together, as expected before the first row (n,)."""
     spread: Array
@@ -147,13 +145,13 @@ class DiscrepancyLevel:
     @classmethod
     def none(cls, n: int) -> "DiscrepancyLevel":
         zero = np.zeros(n)
-        return cls(np.zeros((len(PARTS), n)), zero, zero + SPREAD_UNKNOWN)
+        return cls(np.zeros((len(PARTS), n)), zero, zero, zero + SPREAD_UNKNOWN)
 
     @classmethod
     def expected(cls, before: Array, spread: Array | None = None) -> "DiscrepancyLevel":
         """Before the first row; spread (n,) if a calibration has measured it."""
-        unknown = np.full_like(before, SPREAD_UNKNOWN)
-        return cls(np.sqrt(SHARES)[:, None] * before, before, unknown if spread is None else spread)
+        parts = np.sqrt(SHARES)[:, None] * before
+        return cls(parts[:-1], parts[-1], before, np.full_like(before, SPREAD_UNKNOWN) if spread is None else spread)
 
     @classmethod
     def of_record(cls, calibration: CalibrationRecord, otherwise: Array) -> "DiscrepancyLevel":
@@ -166,7 +164,7 @@ class DiscrepancyLevel:
     @property
     def total(self) -> Array:
         """Of all parts together (n,) [N·m]."""
-        total: Array = np.sqrt((self.sizes**2).sum(axis=0))
+        total: Array = np.sqrt((self.smooth**2).sum(axis=0) + self.rough**2)
         return total
 
     @property
@@ -185,13 +183,13 @@ class DiscrepancyLevel:
         across = complement.swapaxes(1, 2)
         left, columns = across @ residual[:, :, None], across @ known
         one = np.eye(told.shape[1])
-        parts = across @ unit @ complement
+        parts = np.concatenate([across @ unit @ complement, (told[:, :, None] * one)[None]])
         variance = np.where(told, noise[:, None] ** 2, 1.0)  # any where there is nothing
         fixed = columns @ columns.swapaxes(1, 2) + variance[:, :, None] * one
         least = SMALLEST * noise
         expected = np.log(np.maximum(np.sqrt(SHARES)[:, None] * self.before, least))
         weight = 1 / (self.spread**2 + SPREAD_SHARES**2)
-        stds = np.maximum(self.sizes, least)
+        stds = np.maximum(np.vstack([self.smooth, self.rough]), least)
         for _ in range(STEPS):
             each = stds[:, :, None, None] ** 2 * parts
             inverse = np.linalg.inv(each.sum(axis=0) + fixed)
@@ -205,7 +203,7 @@ class DiscrepancyLevel:
             hessian = 2 * flat @ turned.swapaxes(1, 2) + weight[:, None, None] * np.eye(len(parts))
             step = np.linalg.solve(hessian, gradient.T[:, :, None])[:, :, 0].T
             stds = np.maximum(stds * np.exp(-np.clip(step, -LONGEST, LONGEST)), least)
-        return replace(self, sizes=stds, rows=residual.shape[1])
+        return replace(self, smooth=stds[:-1], rough=stds[-1], rows=residual.shape[1])
 
 
 def _complement(columns: Array) -> tuple[Array, Array]:
@@ -220,9 +218,6 @@ def _complement(columns: Array) -> tuple[Array, Array]:
     return vectors * told[:, None, :], told
 
 
-FIRST_ROWS = 2 * LONGEST_WINDOW
-"""Rows of the first epoch, which drift is measured against: three minutes, in which a drift of 0.5 % an hour is 0.03 %.
-Also the most that the level is fitted to, evenly chosen: from 120 it is known to 7 %."""
 EPOCH_ROWS = 40
 """Rows of one epoch after the first: a minute or two, in which a drift of 0.5 % an hour is 0.02 %."""
 EPOCHS = 2
@@ -256,11 +251,13 @@ class Rows:
 class Reference:
     """The first epoch, which stays and which drift is measured against, and the newest later ones.
 
-    A slow drift cannot pass for discrepancy: the first epoch ends, and later ones tell nothing of a gain or an offset
-    (`Posterior`).
+    A slow drift cannot pass for discrepancy: the first epoch ends after `most` rows, and later ones tell nothing of a
+    gain or an offset (`Posterior`).
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, most: int) -> None:
+        """n joints; `most` rows in the first epoch."""
+        self._most = most
         empty = np.empty((0, n))
         self.rows = Rows(empty, empty, empty, empty, np.empty(0, dtype=int))
         """In use."""
@@ -280,7 +277,7 @@ class Reference:
         """Take rows: position, residual, side and temperature (K, n); whether `rows` is another now."""
         if self.is_first:
             self.rows = self.rows.and_then(*more, epoch=0)
-            self._epoch = int(len(self.rows) >= FIRST_ROWS)
+            self._epoch = int(len(self.rows) >= self._most)
             return True
         self._pending = self._pending.and_then(*more, epoch=self._epoch)
         if len(self._pending) < EPOCH_ROWS:
@@ -364,7 +361,7 @@ class Posterior:
         later = (rows.epoch[:, None] == rows.epoch[None]) & (rows.epoch[:, None] > 0)
         covariance += later * free[:, None, None] ** 2 * (1.0 + t[:, :, None] * t[:, None, :])
         index = np.arange(len(rows))
-        covariance[:, index, index] += (noise**2)[:, None]
+        covariance[:, index, index] += (noise**2 + level.rough**2)[:, None]
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
         columns = self._whitener @ of_model.swapaxes(0, 1)
         residual = self._whitener @ rows.residual.T[:, :, None]
@@ -389,11 +386,13 @@ class Posterior:
             covariance -= known.swapaxes(1, 2) @ known
             mean = mean + (known.swapaxes(1, 2) @ self._left)[:, :, 0]
             at = at - known.swapaxes(1, 2) @ self._columns
+        index = np.arange(points.position.shape[0])
+        covariance[:, index, index] += (self._level.rough**2)[:, None]
         return mean.T, covariance, at @ self._factor
 
     def _between(self, a: Points, b: Points) -> Array:
         """Covariance (n, A, B) of the discrepancy and of zeros that follow temperature [N²·m²]."""
-        covariance = self._kernel.weighted(self._level.sizes, a, b)
+        smooth = self._kernel.weighted(self._level.smooth, a, b)
         if a.warmth.any() and b.warmth.any():
-            covariance += self._thermal[:, None, None] ** 2 * a.warmth.T[:, :, None] * b.warmth.T[:, None, :]
-        return covariance
+            smooth += self._thermal[:, None, None] ** 2 * a.warmth.T[:, :, None] * b.warmth.T[:, None, :]
+        return smooth

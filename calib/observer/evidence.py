@@ -1,23 +1,49 @@
-"""The change since the calibration, by the residuals of a window of rows (docs/theory.md, section 6).
+"""Which of several changes explains residuals: least squares of each, compared by BIC (docs/theory.md, section 6)."""
 
-Rows at rest (`cause_test.py`) and of motion (`moving_observer.py`) have hypotheses of their own; the test is the same.
-"""
-
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
-from calib.fit.calibration import VERY_STRONG_EVIDENCE
-from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD
 from gcomp.arrays import Array
-from gcomp.estimate.explanation import ChangeFit, ChangeHypothesis, ResidualTest
-from gcomp.estimate.posterior import linear_posterior
 
 DRIFT = ("gain", "offset", "drift")
 """Causes that are a drift of a torque sensor: of gain, of offset, or both."""
-MOST_GAIN_LIMIT = 1.0
-"""A gain whose limit is above this is not observed: gravity hardly loads the joint."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeHypothesis:
+    """A change since the calibration, as what it does to the readings."""
+
+    cause: str
+    joint: int | None
+    """Index of the joint; None if it concerns the whole arm."""
+    columns: Array
+    """Change of the K residuals per unit of each parameter (K, p)."""
+    price: int | None = None
+    """Parameters charged in the BIC; by default the number of columns."""
+
+    @property
+    def parameters(self) -> int:
+        return self.columns.shape[1] if self.price is None else self.price
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeFit:
+    """Hypotheses fitted together."""
+
+    hypothesis: ChangeHypothesis
+    """The first of them."""
+    bic: float
+    chi2: float
+    values: Array
+    """Parameters of all of them (p,)."""
+    covariance: Array
+    """(p, p); 0 for parameters that the rows do not show."""
+    shown: int
+    """Number of independent parameters that the rows show."""
 
 
 @dataclass(frozen=True)
@@ -54,111 +80,86 @@ class Verdict:
         return next((other for other in self.joints if other != joint), None)
 
 
-@dataclass(frozen=True)
-class DetectionLimits:
-    """Smallest changes that are noticed, in one case of two; 1.5 times as large ones almost always."""
+class ResidualTest:
+    """Residuals of K rows with what they have in common, and the hypotheses that may explain them."""
 
-    gain: Array
-    """Relative (n,); NaN if gravity does not load the joint."""
-    offset: Array
-    """(n,) [N·m]."""
-    rests: int
-    """Rests at other poses, or rows of motion, after which they are noticed."""
+    def __init__(self, residual: Array, covariance: Array, hypotheses: Sequence[ChangeHypothesis]) -> None:
+        """residual (K,), covariance (K, K) to expect of it where nothing has changed."""
+        self.hypotheses = tuple(hypotheses)
+        self._root = np.linalg.cholesky(covariance)
+        white = self.whitened(np.column_stack([residual, *(each.columns for each in hypotheses)]))
+        self.residual: Array = white[:, 0]
+        """Whitened."""
+        ends = np.cumsum([1, *(each.columns.shape[1] for each in hypotheses)])
+        self.columns: list[Array] = [white[:, begin:end] for begin, end in pairwise(ends)]
+        """Whitened, of each hypothesis."""
+        self.chi2 = float(self.residual @ self.residual)
+        """Where nothing has changed."""
 
+    def whitened(self, columns: Array) -> Array:
+        white: Array = np.linalg.solve(self._root, columns)  # scipy takes longer to load
+        return white
 
-class ChangeTest:
-    """Residuals of a window of rows, and the single change that explains them, if any."""
-
-    most_misfit: ClassVar[float]
-    """(χ² − dof)/√(2 dof) above which a change does not explain the rows."""
-    sensor_std: ClassVar[Array] = np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
-    """Standard deviations of a change of gain and offset [1, N·m] before the rows."""
-
-    def __init__(self, found: ResidualTest, doubt: float, inexact: float) -> None:
-        """doubt: relative variance of the covariance expected; inexact: most that an effect's own shape may be off, as
-        a share."""
-        self.found, self._doubt, self._inexact = found, doubt, inexact
-
-    def verdict(self) -> Verdict:
-        """The winning class, or why none wins: cause "none", "unknown" or "ambiguous"."""
-        fits = sorted(map(self.fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
-        classes = {"none": self.found.chi2}
-        for fit in reversed(fits):
-            classes[self.class_of(fit.hypothesis)] = fit.bic
-        top = min(classes.values())
-        weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
-        nearest = sorted(classes.items(), key=lambda item: item[1])[:6]
-        evidence = {name: round(float(bic - top), 1) for name, bic in nearest}
-
-        def answer(cause: str, fit: ChangeFit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
-            known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))
-            joint = fit.hypothesis.joint if fit else None
-            return Verdict(cause, joint, float(weights[of] / sum(weights.values())), *known, evidence, rivals)
-
-        if not fits or self.found.chi2 - fits[0].bic < VERY_STRONG_EVIDENCE:
-            evidence["misfit"] = self.misfit(self.found.chi2, 0)
-            return answer("unknown" if evidence["misfit"] > self.most_misfit else "none", None, "none")
-        best, winner, name = fits[0], fits[0].hypothesis, self.class_of(fits[0].hypothesis)
-        inexact = self._inexact**2 * (self.found.chi2 - best.chi2)
-        evidence["misfit"] = self.misfit(best.chi2 - inexact, winner.columns.shape[1])
-        if evidence["misfit"] > self.most_misfit or not self.is_possible(best):
-            return self.several_changes() or answer("unknown", None, name)
-        near = [fit.hypothesis for fit in fits[1:] if fit.bic - best.bic < VERY_STRONG_EVIDENCE]
-        if self.is_of_the_arm(best, near):
-            return answer("none", None, "none")
-        rivals = tuple(dict.fromkeys(self.class_of(entry) for entry in near if not self.kin(entry, winner)))
-        return answer("ambiguous" if rivals else winner.cause, best, name, rivals)
+    def index(self, cause: str, joint: int | None) -> int:
+        """Number of a hypothesis; raises ValueError where there is none."""
+        return [(each.cause, each.joint) for each in self.hypotheses].index((cause, joint))
 
     def fit(self, *indices: int) -> ChangeFit:
-        """Generalised least squares of hypotheses together."""
-        return self.found.fit(*indices)
+        columns = np.hstack([self.columns[index] for index in indices])
+        return self.fit_columns([self.hypotheses[index] for index in indices], columns, self.residual)
 
-    def class_of(self, entry: ChangeHypothesis) -> str:
-        """Class of an entry in the comparison of verdicts."""
-        return entry.cause if entry.joint is None else f"{entry.cause}_{entry.joint + 1}"
+    @staticmethod
+    def fit_columns(together: Sequence[ChangeHypothesis], columns: Array, target: Array) -> ChangeFit:
+        """Likewise with whitened columns (K, p) and a whitened target (K,) of their own."""
+        u, s, vt, size = _decomposed(columns)
+        kept = s > 0
+        back = (vt[kept].T / s[kept]) / size[:, None]
+        explained = u[:, kept].T @ target
+        covariance, shown = back @ back.T, int(kept.sum())
+        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
+        covariance[hidden] = covariance[:, hidden] = 0.0
+        chi2 = float(target @ target) - float(explained @ explained)
+        price = sum(each.parameters for each in together) - (columns.shape[1] - shown)
+        bic = chi2 + price * float(np.log(len(target)))
+        return ChangeFit(together[0], bic, chi2, back @ explained, covariance, shown)
 
-    def kin(self, entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:
-        """Whether an entry is not a rival of the winner."""
-        return self.class_of(entry) == self.class_of(winner)
+    def misfit(self, chi2: float, parameters: int, doubt: float) -> float:
+        """χ² above its degrees of freedom, in standard deviations; `doubt`: relative variance of what is expected."""
+        free = max(len(self.residual) - parameters, 1)
+        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + doubt))), 2)
 
-    def is_possible(self, best: ChangeFit) -> bool:
-        """Whether a change can have the size found: a payload has a mass."""
-        return best.hypothesis.cause != "payload" or bool(best.values[0] > 0)
+    def noticed(self, index: int, rivals: Iterable[int], needed: float) -> float:
+        """Size of a hypothesis' change that wins in one case of two by a BIC of `needed`: over none, and all rivals."""
+        bases = ((self._bases[rival], self.hypotheses[rival].parameters) for rival in rivals)
+        return smallest_noticed_change(self.columns[index][:, 0], bases, needed)
 
-    def is_of_the_arm(self, best: ChangeFit, near: list[ChangeHypothesis]) -> bool:
-        """Whether an effect is no larger than what the arm has anyway; `near` fit nearly as well."""
-        return False
+    @cached_property
+    def _bases(self) -> list[Array]:
+        return [span(columns) for columns in self.columns]
 
-    def several_changes(self) -> Verdict | None:
-        """Two or more changes that explain the rows where no single one does; None if none do."""
-        return None
 
-    def misfit(self, chi2: float, parameters: int) -> float:
-        return self.found.misfit(chi2, parameters, self._doubt)
+def span(columns: Array) -> Array:
+    """An orthonormal basis (K, r) of whitened columns (K, p), of which r are independent."""
+    u, s, _, _ = _decomposed(columns)
+    return u[:, s > 0]
 
-    def sensor(self, joint: int) -> tuple[Array, Array]:
-        """Change of a joint's gain and offset (2,), drawn towards nothing where rows tell little; its covariance."""
-        places = [self.found.places.get((cause, joint)) for cause in ("gain", "offset")]
-        told = [at for at, place in enumerate(places) if place is not None]
-        change, covariance = np.zeros(2), np.diag(self.sensor_std**2)
-        if told:
-            columns = np.hstack([self.found.columns[place] for place in places if place is not None])
-            fit = linear_posterior(columns, self.found.residual, np.zeros(len(told)), self.sensor_std[told])
-            change[told], covariance[np.ix_(told, told)] = fit.x, fit.covariance
-        return change, covariance
 
-    def noticed(self, cause: str, joint: int) -> float:
-        """Size of a change that wins in one case of two: over "none", and over every rival; NaN where no row tells."""
-        index, entries = self.found.places.get((cause, joint)), self.found.hypotheses
-        if index is None:
-            return float("nan")
-        rivals = [k for k, entry in enumerate(entries) if not self.kin(entry, entries[index])]
-        return self.found.noticed(index, rivals, VERY_STRONG_EVIDENCE)
+def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
+    """u, s, vt of columns (K, p) in units of their lengths, and these; s is 0 where columns depend on others."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size <= 1e-9] = 1.0
+    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
+    return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
 
-    def limits(self, n: int, rests: int, longer: float = 1.0) -> DetectionLimits:
-        """Limits of n joints in work like that of the rows, by a window `longer` than theirs."""
-        gain, offset = (
-            np.array([self.noticed(cause, j) for j in range(n)]) / np.sqrt(longer) for cause in ("gain", "offset")
-        )
-        gain[~(gain <= MOST_GAIN_LIMIT)] = np.nan
-        return DetectionLimits(gain, offset, rests)
+
+def smallest_noticed_change(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
+    """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
+
+    Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
+    """
+    size, once = float(own @ own), float(np.log(len(own)))
+    needed = evidence + once
+    for basis, price in rivals if size > 0 else ():
+        alike = float(((basis.T @ own) ** 2).sum()) / size
+        needed = max(needed, (evidence - (price - 1) * once) / max(1 - alike, 1e-9))
+    return float(np.sqrt(needed / max(size, 1e-30)))

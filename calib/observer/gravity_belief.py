@@ -1,6 +1,5 @@
 """Belief about the gravity model and what it lacks, adapted to the sensors as they were installed."""
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.motion.static_reading import StaticReading, stack
-from calib.observer.discrepancy import FIRST_ROWS, DiscrepancyLevel, Kernel, Posterior, Reference, Rows
+from calib.observer.discrepancy import DiscrepancyLevel, Kernel, Posterior, Reference, Rows
 from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -22,7 +20,7 @@ of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors
 THERMAL, TOLD = 1.0, 0.3
 """Where drives tell their temperature: how far a zero follows a rise of 20 K, as a share of the level, and the share of
 WANDER that is left, since the sensor's own temperature is another."""
-LEVEL_ARRAYS = ("sizes", "before", "spread")
+LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
 
 
 @dataclass(frozen=True)
@@ -47,12 +45,12 @@ class Expected:
             covariance[j::n, j::n] += self.blocks[j]
         return covariance
 
-    @property
-    def of_joints(self) -> Array:
-        """Covariance of each joint's residuals (n, K, K)."""
-        n, count, _ = self.blocks.shape
-        columns = self.columns.reshape(count, n, -1).swapaxes(0, 1)
-        return np.asarray(self.blocks + columns @ columns.swapaxes(1, 2))
+    def of_joint(self, j: int) -> Array:
+        """Covariance (K, K) of one joint's residuals."""
+        n = len(self.blocks)
+        columns = self.columns[j::n]
+        covariance: Array = self.blocks[j] + columns @ columns.T
+        return covariance
 
     @property
     def variance(self) -> Array:
@@ -76,12 +74,14 @@ class GravityBelief:
         covariance: Array,
         position_std: float = 0.0,
         level: DiscrepancyLevel | None = None,
+        first_rows: int = 120,
         wander: Array | float = np.inf,
     ) -> None:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
 
         position_std [rad] is that of a position sensor's zero; without a level the model has no other errors. wander
-        (n,) [N·m]: most that zeros move with temperature (standard deviation).
+        (n,) [N·m]: most that zeros move with temperature (standard deviation). first_rows: rows of the
+        first epoch, and the most that the level is fitted to, evenly chosen: with 120 it is known to 7 %, in 50 ms.
         """
         self.arm = arm
         self.beta: Array = np.array(beta, dtype=float)
@@ -89,12 +89,12 @@ class GravityBelief:
         kept = values > 1e-12 * max(values[-1], 1e-300)
         self._factor: Array = vectors[:, kept] * np.sqrt(values[kept])
         self._tool: Array = np.empty((self.beta.size, 0))
-        self._position_std, self._wander = position_std, wander
+        self._position_std, self._wander, self._first_rows = position_std, wander, first_rows
         self.mass = 0.0
         """Mass of the loads that the model has taken over as tools [kg]."""
         self.level = DiscrepancyLevel.none(arm.n) if level is None else level
         self._noise: Array = np.zeros(arm.n)
-        self._reference = Reference(arm.n)
+        self._reference = Reference(arm.n, first_rows)
         self._posterior: Posterior | None = None
         self._kernel: Kernel | None = None
 
@@ -154,24 +154,20 @@ class GravityBelief:
         self._reference.close()
         self._kernel = self._posterior = None
 
-    def learn(self, rows: Sequence[StaticReading], noise: Array) -> None:
-        """Take rows free of drift as reference; noise (n,) [N·m] of their torques."""
-        if not rows or not self._reference.add(*self._residuals(rows)):
+    def learn(self, q: Array, torque: Array, side: Array, noise: Array, temperature: Array | None = None) -> None:
+        """Take K rows free of drift as reference: q (K, n) [rad], torque (K, n) [N·m], side (K, n), noise (n,) [N·m],
+        temperature (K, n) [°C]."""
+        told = np.full(q.shape, np.nan) if temperature is None else temperature
+        if not self._reference.add(q, torque - self.torque(q), side, told):
             return
         self._noise, self._posterior = noise, None
         self._fit_level(self._reference.rows)
 
-    def adapt(self, rows: Sequence[StaticReading], noise: Array) -> None:
+    def adapt(self, q: Array, torque: Array, side: Array, noise: Array) -> None:
         """Adapt the level alone, to rows that may have an offset, a gain or a payload that is not known."""
         self._noise, self._posterior = noise, None
-        self._fit_level(self._reference.rows.and_then(*self._residuals(rows), epoch=-1))
-
-    def _residuals(self, rows: Sequence[StaticReading]) -> tuple[Array, Array, Array, Array]:
-        """Positions, torques less those of the model, sides of approach and temperatures (K, n)."""
-        q, torque, side, temperature = (
-            stack(rows, name) for name in ("position", "torque", "direction", "temperature")
-        )
-        return q, torque - self.torque(q), side, temperature
+        untold = np.full(q.shape, np.nan)
+        self._fit_level(self._reference.rows.and_then(q, torque - self.torque(q), side, untold, epoch=-1))
 
     def close(self) -> None:
         """A sensor was corrected: rows from now on tell nothing of gains and offsets."""
@@ -185,7 +181,7 @@ class GravityBelief:
     def _fit_level(self, rows: Rows) -> None:
         if not self.level.before.any():
             return
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(FIRST_ROWS, len(rows))).astype(int))]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(self._first_rows, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
         at_origin, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, rows.position)
@@ -235,8 +231,6 @@ class GravityBelief:
         self._tool = as_array("tool", np.reshape(values.get("tool", []), (size, -1)), (size, None))
         self._noise, self.mass = as_array("noise", values.get("noise", np.zeros(n)), (n,)), float(values["mass"])
         if saved is not None:
-            if "smooth" in saved:  # by earlier versions
-                saved = {**saved, "sizes": [*saved["smooth"], saved["rough"]]}
             stds = {name: as_array(name, saved[name], np.shape(getattr(self.level, name))) for name in LEVEL_ARRAYS}
             self.level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
         self._reference = restored(self._reference, values)

@@ -1,4 +1,7 @@
-"""From an alarm to a decision: the rows gathered for the next cause test, and the results of the tests before it."""
+"""From an alarm to a decision: the rows gathered for the next cause test, and the results of the tests before it.
+
+While no alarm is open, audits test the last rows for effects too small or too slow for an alarm, or learn from them.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,21 +10,18 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing
-from calib.observer.discrepancy import PLACE_SIZE
+from calib.observer.evidence import Verdict
 from calib.observer.saved_values import read_rows, save_rows
-
-PLACE_ROWS = 3
-"""Rows of one place that a window takes: another one there adds no information about the rest of the joint range."""
+from calib.observer.tracking import PLACE_ROWS, PLACE_SIZE, Tracking
 
 
 class Investigation:
     """Progress from an alarm to a decision; with no alarm, the rows of the next audit."""
 
-    def __init__(self, n: int, window: int) -> None:
-        """n joints; rows of one test."""
-        self._n, self._rows = n, window
+    def __init__(self, n: int, config: ObserverConfig) -> None:
+        self._n, self._config = n, config
         self.held = False
         """Whether an alarm is open: estimates are held until a verdict."""
         self.silent = False
@@ -67,7 +67,7 @@ class Investigation:
 
     def is_due(self) -> bool:
         """Whether there are rows enough for the next test; if so their count starts again."""
-        due = self.fresh >= (self._rows if self.held else AUDIT_ROWS)
+        due = self.fresh >= (self._config.window if self.held else AUDIT_ROWS)
         if due:
             self.fresh = 0
         return due
@@ -115,3 +115,54 @@ class Investigation:
         self.fresh, self.repeated, self.carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
         self.held, self.doubtful, self.reasons = bool(values["held"]), int(values["doubtful"]), tuple(values["reasons"])
         self.learned, self.silent = int(values.get("learned", 0)), bool(values.get("silent", False))
+
+
+DOUBTED = 2
+"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them.
+
+An alarm is open, or the first epoch of the reference."""
+
+
+def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> None:
+    """Test the last rows: those free of any effect become reference; an effect opens a silent investigation."""
+    window = state.window[-LONGEST_WINDOW:]
+    if not tracking.belief.learnt:
+        if len(window) < config.window:
+            return
+        tracking.adapt(window[: -len(window) // 4])  # a change in the newest rows is not discrepancy
+    verdict = tracking.cause_test(window).verdict()
+    if verdict.cause == "unknown":
+        state.doubtful += 1
+        # longer than a change takes to fill the window; an alarm would be open if it were a contact
+        patience = DOUBTED if tracking.belief.is_first else LONGEST_WINDOW // AUDIT_ROWS + 1
+        if state.doubtful >= patience:
+            tracking.adapt(window)
+            verdict = tracking.cause_test(window).verdict()
+    state.doubtful = state.doubtful if verdict.cause == "unknown" else 0
+    if verdict.cause == "none":
+        tracking.learn(state.settled(tracking.belief.is_first))
+        return
+    del state.window[:-LONGEST_WINDOW]
+    state.learned = min(state.learned, len(state.window))
+    if verdict.cause not in ("unknown", "ambiguous"):  # an alarm follows if those last
+        state.start(silent=True)
+
+
+def may_adapt(tracking: Tracking, window: list[StaticReading], config: ObserverConfig) -> bool:
+    """Whether rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open."""
+    return not tracking.belief.learnt or len(window) >= DOUBTED * config.window
+
+
+def is_confirmed(tracking: Tracking, state: Investigation, test: CauseTest, verdict: Verdict) -> bool:
+    """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
+    if verdict.cause in ("none", "unknown", "ambiguous"):
+        if len(state.window) >= LONGEST_WINDOW:
+            state.resume()
+            tracking.resume()
+        return False
+    suspected, state.suspected = state.suspected, ("drift" if verdict.is_drift else verdict.cause, verdict.joints)
+    if suspected == state.suspected:
+        return True
+    state.first = Agreeing(state.window, test, frozenset(verdict.joints)) if verdict.is_drift else None
+    state.window = []
+    return False

@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
-from calib.motion.static_reading import LEAST_SAMPLES, StaticReading, stack
+from calib.motion.static_reading import LEAST_SAMPLES
 from calib.observer.config import LONGEST_GAP
 from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
@@ -39,34 +39,36 @@ TURNED = 0.03
 """After a reversal friction has turned round once the joint has moved so far [rad]."""
 
 
-def passage(t: float, joint: int, position: Array, torque: float, velocity: float, temperature: float) -> StaticReading:
-    """The reading of one joint in motion: positions of all (n,) [rad], torque of its motor [N·m], velocity with sign
-    [rad/s], temperature of its drive [°C], NaN if that is not known."""
-    own = np.arange(len(position)) == joint
-    torques, temperatures = (np.where(own, value, np.nan) for value in (torque, temperature))
-    side = np.where(own, np.sign(velocity), 0.0)
-    return StaticReading.of(t, position, torques, side, joint=joint, speed=abs(velocity), temperature=temperatures)
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """One joint's averages over a stretch of motion."""
 
+    t: float
+    """Middle of the stretch [s]."""
+    joint: int
+    position: Array
+    """Of all joints (n,) [rad]."""
+    torque: float
+    """Of this joint's motor [N·m]."""
+    velocity: float
+    """Of this joint, with sign [rad/s]."""
+    temperature: float
+    """Of its drive [°C]; NaN if it is not known."""
 
-def save_passages(rows: Sequence[StaticReading]) -> list[list[Any]]:
-    """As JSON values, without the time, since clocks restart with the machine."""
-    own = ((row, np.nansum(row.torque), row.direction.sum() * row.speed) for row in rows)
-    return [
-        [row.joint, row.position.tolist(), float(torque), float(velocity), known(row.temperature)[row.joint]]
-        for row, torque, velocity in own
-    ]
+    def to_json(self) -> list[Any]:
+        """As JSON values, without the time, since clocks restart with the machine."""
+        warm = known(np.array([self.temperature]))[0]
+        return [self.joint, self.position.tolist(), self.torque, self.velocity, warm]
 
-
-def read_passages(values: Any, n: int) -> list[StaticReading]:
-    """Read back; raises one of UNREADABLE where the values do not fit n joints."""
-    return [_passage(n, *row) for row in values]
-
-
-def _passage(n: int, joint: Any, position: Any, torque: Any, velocity: Any, warm: Any) -> StaticReading:
-    if not 0 <= int(joint) < n:
-        raise ValueError(f"joint {joint} of {n}")
-    temperature = np.nan if warm is None else float(warm)
-    return passage(0.0, int(joint), as_array("position", position, (n,)), float(torque), float(velocity), temperature)
+    @classmethod
+    def from_json(cls, values: Any, n: int) -> "Passage":
+        """Read back; raises TypeError, ValueError or LookupError where the values do not fit n joints."""
+        joint, position, torque, velocity, warm = values
+        if not 0 <= int(joint) < n:
+            raise ValueError(f"joint {joint} of {n}")
+        temperature = np.nan if warm is None else float(warm)
+        where = as_array("position", position, (n,))
+        return cls(0.0, int(joint), where, float(torque), float(velocity), temperature)
 
 
 @dataclass
@@ -80,7 +82,7 @@ class PassageDetector:
         self._side = np.zeros(self.n)
         self._turned_at = np.full(self.n, np.nan)
 
-    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[StaticReading]:
+    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Passage]:
         """Take one sample ((n,) each, SI, temperatures in °C); the rows of the stretch that it completes."""
         if not (np.isfinite(position).all() and np.isfinite(torque).all()):
             self._samples.clear()
@@ -97,7 +99,7 @@ class PassageDetector:
         self._samples = [self._samples[-1]]
         return rows
 
-    def _rows(self, temperature: Array) -> list[StaticReading]:
+    def _rows(self, temperature: Array) -> list[Passage]:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
         if len(times) < LEAST_SAMPLES:
             return []
@@ -116,7 +118,7 @@ class PassageDetector:
         weight /= weight.sum()
         here, pull, when = weight @ positions, weight @ torques, float(weight @ times)
         return [
-            passage(when, int(j), here, float(pull[j]), float(velocity[j]), float(temperature[j]))
+            Passage(when, int(j), here, float(pull[j]), float(velocity[j]), float(temperature[j]))
             for j in np.flatnonzero((side != 0) & onward & settled)
         ]
 
@@ -157,9 +159,7 @@ class MotorBelief:
         self.mean = np.zeros(self._at["rho"].stop)
         std = np.zeros_like(self.mean)
         self.mean[self._at["gain"]] = 1.0
-        scale = np.abs(calibration.values("gain", 1.0))
-        std[self._at["gain"]] = calibration.std("gain", doubt.gain) / scale
-        std[self._at["offset"]] = calibration.std("offset", doubt.offset_share * rated) / scale
+        std[self._at["gain"]], std[self._at["offset"]], zero = _sensors(calibration, rated, doubt)
         for family in ("coulomb", "load", "viscous", "asymmetry"):
             self.mean[self._at[family]], std[self._at[family]] = np.array([getattr(each, family) for each in motors]).T
         warming = np.array([each.gain_per_kelvin or (0.0, 0.0) for each in motors])
@@ -167,8 +167,7 @@ class MotorBelief:
         self.reference_temperature = np.array(
             [np.nan if each.temperature is None else each.temperature for each in motors]
         )
-        zero = calibration.std("position_offset", 0.0)[:-1]
-        std[self._at["zero"]] = np.append(np.hypot(zero, ZERO_STD), LAST_ZERO)
+        std[self._at["zero"]] = np.append(np.hypot(zero[:-1], ZERO_STD), LAST_ZERO)
         coulomb = np.maximum(self.mean[self._at["coulomb"]], 1e-3 * rated)
         std[self._at["uneven"]] = np.repeat(doubt.uneven * coulomb, (len(std[self._at["uneven"]])) // n)
         self.mean[self._at["beta"]] = gravity.beta
@@ -177,20 +176,27 @@ class MotorBelief:
         fitted = np.array([joint.residual_std or np.nan for joint in calibration.joints])
         self.sigma = np.sqrt(ALIKE) * np.where(np.isfinite(fitted), fitted, SIGMA_SHARE * rated)
         """Standard deviation of a row, and of what it has in common with its neighbours (n,) [N·m]."""
-        self.learnt: list[StaticReading] = []
+        self.learnt: list[Passage] = []
         """Rows that the belief rests on, beside the records."""
         self._first = (self.mean, self.covariance, self.sigma)
 
-    def rows(self, passages: Sequence[StaticReading]) -> StaticReadings:
+    def rows(self, passages: Sequence[Passage]) -> StaticReadings:
+        joint = np.array([each.joint for each in passages], dtype=np.int64)
+        warm = np.array([each.temperature for each in passages]) - self.reference_temperature[joint]
+        own = np.arange(self.arm.n) == joint[:, None]
+
+        def of_own(values: Array) -> Array:
+            return np.asarray(own * values[:, None])
+
         return StaticReadings(
-            stack(passages, "position"),
-            stack(passages, "torque"),
+            np.array([each.position for each in passages]).reshape(-1, self.arm.n),
+            np.where(own, np.array([each.torque for each in passages])[:, None], np.nan),
             self.sigma,
-            velocity=stack(passages, "direction") * stack(passages, "speed")[:, None],
-            warmth=np.nan_to_num(stack(passages, "temperature") - self.reference_temperature),
+            velocity=of_own(np.array([each.velocity for each in passages])),
+            warmth=of_own(np.nan_to_num(warm)),
         )
 
-    def linearised(self, passages: Sequence[StaticReading], carried: Array | None = None) -> tuple[Array, Array, Array]:
+    def linearised(self, passages: Sequence[Passage], carried: Array | None = None) -> tuple[Array, Array, Array]:
         """(Residuals (K,) [N·m], derivatives (K, P) of the readings, covariance (K, K) to expect of the residuals).
 
         `carried` (2n,) [kg·m] is added to the mass moments.
@@ -202,12 +208,11 @@ class MotorBelief:
         predicted, jacobian = model.linearised(mean)
         covariance = jacobian @ self.covariance @ jacobian.T
         covariance[np.diag_indices(len(jacobian))] += self.sigma[model.joint] ** 2
-        warmer = stack(passages, "temperature") - self.reference_temperature
-        untold = np.isnan(warmer).all(axis=1)  # of the row's own joint, that is
+        untold = np.array([np.isnan(each.temperature - self.reference_temperature[each.joint]) for each in passages])
         by_gain = jacobian[:, self._at["gain"]] * np.where(untold, UNKNOWN_WARMTH_STD, KNOWN_WARMTH_STD)[:, None]
         return model.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
 
-    def learn(self, passages: Sequence[StaticReading]) -> Self:
+    def learn(self, passages: Sequence[Passage]) -> Self:
         """The belief with more rows in which nothing has changed."""
         belief = copy(self)
         belief.learnt = [*self.learnt, *passages]
@@ -250,3 +255,16 @@ def _motor(motor: MotorTorque | None) -> MotorTorque:
     """A joint without a record of friction, which did not creep, may have any."""
     nothing = (0.0, 0.0)
     return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
+
+
+def _sensors(calibration: CalibrationRecord, rated: Array, doubt: MotorDoubt) -> tuple[Array, Array, Array]:
+    """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; where one is not known, what is
+    assumed before any sweep."""
+    known = {name: float(row[at]) ** 0.5 for at, (name, row) in enumerate(
+        zip(calibration.covariance_of, calibration.covariance, strict=True))}  # fmt: skip
+    gain, offset, zero = (np.empty(len(rated)) for _ in range(3))
+    for j, joint in enumerate(calibration.joints):
+        gain[j] = known.get(f"{joint.name}.gain", doubt.gain) / abs(joint.gain or 1.0)
+        offset[j] = known.get(f"{joint.name}.offset", doubt.offset_share * rated[j]) / abs(joint.gain or 1.0)
+        zero[j] = known.get(f"{joint.name}.position_offset", 0.0)
+    return gain, offset, zero

@@ -15,52 +15,105 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
+from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS, VERY_STRONG_EVIDENCE
 from calib.fit.sweep_readings import FEWEST
-from calib.motion.static_reading import StaticReading, stack
-from calib.observer.cause_test import INEXACT
-from calib.observer.config import LONGEST_WINDOW
+from calib.observer.cause_test import INEXACT, DetectionLimits
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW
 from calib.observer.decision import AGREEMENT, DriftFinding, Event, verdict_evidence
-from calib.observer.evidence import ChangeTest, DetectionLimits
-from calib.observer.motor_belief import MotorBelief, PassageDetector, read_passages, save_passages
+from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
+from calib.observer.motor_belief import MotorBelief, Passage, PassageDetector
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
-from gcomp.estimate.explanation import ChangeFit, ChangeHypothesis, ResidualTest, distance
+from gcomp.estimate.posterior import linear_posterior
 from gcomp.identify.motor_model import family_slices
 
+MISFIT = 8.0
+"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
+by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
 
-class MotionTest(ChangeTest):
-    """The candidates fitted to K rows of motion."""
+UNSEEN_STD = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
+"""Standard deviations of a joint's gain and offset [N·m] where rows of motion tell nothing; a choice."""
+NOTHING = np.zeros(2), np.diag(UNSEEN_STD**2)
+"""Their change then, drawn to 0, and its covariance."""
 
-    most_misfit = 8.0
-    """120 rows then scatter by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is
-    far beyond."""
-    sensor_std = 10 * ChangeTest.sensor_std
 
-    def __init__(self, belief: MotorBelief, passages: Sequence[StaticReading]) -> None:
+class ChangeTest:
+    """The candidates fitted to K rows."""
+
+    def __init__(self, belief: MotorBelief, passages: Sequence[Passage]) -> None:
         """Rows after those that the belief rests on."""
         self._belief, self._passages = belief, passages
         residual, jacobian, covariance = belief.linearised(passages)
-        found = ResidualTest(residual, covariance, _candidates(belief, jacobian, stack(passages, "joint")))
-        super().__init__(found, len(passages) / (len(belief.learnt) + USUAL_ROWS), INEXACT)
+        joint = np.array([each.joint for each in passages])
+        self.found = ResidualTest(residual, covariance, _candidates(belief, jacobian, joint))
+
+    def verdict(self) -> Verdict:
+        """The change that explains the rows; cause "none", "unknown" or "ambiguous" where no single one does."""
+        fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
+        nothing = np.empty(0)
+        misfit = self._misfit(self.found.chi2, 0)
+        if not fits or self.found.chi2 - fits[0].bic < VERY_STRONG_EVIDENCE:
+            cause = "none" if misfit <= MISFIT else "unknown"
+            return Verdict(cause, None, 1.0, nothing, np.empty((0, 0)), {"misfit": misfit})
+        best, others = fits[0], fits[1:]
+        scores = np.array([fit.bic for fit in fits] + [self.found.chi2])
+        weight = np.exp(-(scores - best.bic) / 2)
+        nearest = others[0].bic - best.bic if others else np.inf
+        evidence = {"none": round(self.found.chi2 - best.bic, 1), "next": round(float(nearest), 1)}
+        inexact = INEXACT**2 * (self.found.chi2 - best.chi2)
+        evidence["misfit"] = self._misfit(best.chi2 - inexact, len(best.values))
+        values, covariance = best.values, best.covariance
+        cause, joint = best.hypothesis.cause, best.hypothesis.joint
+        found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
+        if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
+            return replace(found, cause="unknown", joint=None)
+        rivals = tuple(fit.hypothesis.cause for fit in others if fit.bic - best.bic < VERY_STRONG_EVIDENCE)
+        return replace(found, cause="ambiguous", rivals=rivals) if rivals else found
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
         """Whether these rows show that an earlier change of these values is there no more."""
         if not values.size or cause == "unknown":
             return True  # it had no size
-        own = self.found.places.get((cause, joint))
+        own = self._index(cause, joint)
         if own is None:
             return False
-        fit = self.fit(own)
-        return distance(fit.values - values, fit.covariance) > AGREEMENT + 2 * fit.shown
+        fit = self._fit(own)
+        known = np.diag(fit.covariance) > 0
+        away = (fit.values - values)[known]
+        apart = float(away @ np.linalg.pinv(fit.covariance[np.ix_(known, known)]) @ away)
+        return bool(apart > AGREEMENT + 2 * known.sum())
 
-    def fit(self, *indices: int) -> ChangeFit:
+    def sensor(self, joint: int) -> tuple[Array, Array]:
+        """Change of a joint's gain and offset (2,) [1, N·m], fitted together, and their covariance (2, 2).
+
+        Drawn towards nothing where the rows tell little.
+        """
+        places = [self._index(cause, joint) for cause in ("gain", "offset")]
+        columns = [self.found.columns[place] for place in places if place is not None]
+        if not columns:
+            return NOTHING
+        fit = linear_posterior(np.hstack(columns), self.found.residual, np.zeros(2), UNSEEN_STD)
+        return fit.x, fit.covariance
+
+    def noticed(self, cause: str, joint: int) -> float:
+        """Size of a change that is noticed in one case of two by as many rows: over "none", and over every rival."""
+        own = self._index(cause, joint)
+        if own is None:
+            return float("nan")
+        rivals = [k for k in range(len(self.found.hypotheses)) if k != own]
+        return self.found.noticed(own, rivals, VERY_STRONG_EVIDENCE)
+
+    def _index(self, cause: str, joint: int | None) -> int | None:
+        known = [(each.cause, each.joint) for each in self.found.hypotheses]
+        return known.index((cause, joint)) if (cause, joint) in known else None
+
+    def _fit(self, index: int) -> ChangeFit:
         """A payload is linearised again at the load found: friction goes with torque, whose sign a load may turn."""
-        fit, own = super().fit(*indices), self.found.hypotheses[indices[0]]
+        fit, own = self.found.fit(index), self.found.hypotheses[index]
         for _ in range(NOISE_ROUNDS if own.cause == "payload" else 0):
             arm, values = self._belief.arm, fit.values
             per_unit = np.column_stack(payload_columns(arm))
@@ -70,6 +123,10 @@ class MotionTest(ChangeTest):
             change = self.found.fit_columns([own], white[:, 1:], white[:, 0])
             fit = replace(change, values=values + change.values)
         return fit
+
+    def _misfit(self, chi2: float, parameters: int) -> float:
+        known = len(self._belief.learnt) + USUAL_ROWS
+        return self.found.misfit(chi2, parameters, (len(self._passages) - parameters) / known)
 
 
 def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[ChangeHypothesis]:
@@ -109,17 +166,19 @@ class MovingObserver:
 
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated_torque: Array) -> None:
         """Against records of creep sweeps; rated_torque (n,) [N·m]."""
-        self.arm, self._angle = arm, calibration.angle
+        self.arm = arm
+        self._position_gain = calibration.values("position_gain", 1.0)
+        self._position_offset = calibration.values("position_offset", 0.0)
         self._detector = PassageDetector(arm.n)
         self._belief = MotorBelief(arm, calibration, gravity, np.asarray(rated_torque, dtype=float))
-        self._block: list[StaticReading] = []
-        self._recent: list[StaticReading] = []
+        self._block: list[Passage] = []
+        self._recent: list[Passage] = []
         self._count = np.zeros(arm.n, dtype=int)
         self._agreeing: tuple[str, int | None] = ("none", None)
         self._reported: tuple[str, int | None, Array] = ("none", None, np.empty(0))
         """Cause, joint and parameters of the newest verdict that was an event."""
         self._blocks = 0
-        self._tested: tuple[int, MotionTest] | None = None
+        self._tested: tuple[int, ChangeTest] | None = None
 
     @property
     def rows(self) -> int:
@@ -140,15 +199,15 @@ class MovingObserver:
             events += self.handle_row(passage)
         return events
 
-    def handle_row(self, passage: StaticReading) -> list[Event]:
+    def handle_row(self, passage: Passage) -> list[Event]:
         """Take one row, with true angles."""
-        self._count += np.arange(self.arm.n) == passage.joint
+        self._count[passage.joint] += 1
         self._block.append(passage)
         if len(self._block) < LONGEST_WINDOW:
             return []
         block, self._block = self._block, []
         self._recent = (self._recent + block)[-LONGEST:]
-        test = MotionTest(self._belief, self._recent)
+        test = ChangeTest(self._belief, self._recent)
         verdict = test.verdict()
         if verdict.cause == "none" and not test.denies(*self._reported):
             return []  # these rows do not show the change that was found
@@ -168,18 +227,18 @@ class MovingObserver:
         return [Event(passage.t, "verdict", joint, verdict_evidence(verdict, self.arm.names) | {"motor": True})]
 
     def estimate(self) -> Estimate:
-        test, n = self._test(), self.arm.n
-        nothing = np.zeros(2), np.diag(MotionTest.sensor_std**2)
-        found = [nothing if test is None else test.sensor(j) for j in range(n)]
-        change, covariance = (np.array(each) for each in zip(*found, strict=True))
-        return Estimate.of(change, covariance, self._count)
+        test = self._test()
+        found = [NOTHING if test is None else test.sensor(j) for j in range(self.arm.n)]
+        change, std = (np.array(each).T for each in zip(*((c, np.sqrt(np.diag(v))) for c, v in found), strict=True))
+        return Estimate(1 + change[0], std[0], change[1], std[1], self._count.copy())
 
     def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, by motion like the latest; NaN where it tells none."""
         test, n = self._test(), self.arm.n
         if test is None:
             return DetectionLimits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + LONGEST_WINDOW)
-        return test.limits(n, LONGEST + LONGEST_WINDOW)
+        gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) for cause in ("gain", "offset"))
+        return DetectionLimits(gain, offset, LONGEST + LONGEST_WINDOW)
 
     def model_torque(self, position: Array) -> Array:
         torque = self._belief.gravity_torque(np.atleast_2d(self._angle(position)))
@@ -192,7 +251,7 @@ class MovingObserver:
     def save(self) -> dict[str, Any]:
         """The rows that the belief rests on, and those since, as JSON values."""
         rows = {"learnt": self._belief.learnt, "block": self._block, "recent": self._recent}
-        saved: dict[str, Any] = {name: save_passages(some) for name, some in rows.items()}
+        saved: dict[str, Any] = {name: [each.to_json() for each in some] for name, some in rows.items()}
         cause, joint, values = self._reported
         return {"schema": SCHEMA, "count": self._count.tolist(), "reported": [cause, joint, values.tolist()], **saved}
 
@@ -201,7 +260,9 @@ class MovingObserver:
         try:
             if values["schema"] != SCHEMA:
                 return False
-            learnt, block, recent = (read_passages(values[name], n) for name in ("learnt", "block", "recent"))
+            learnt, block, recent = (
+                [Passage.from_json(each, n) for each in values[name]] for name in ("learnt", "block", "recent")
+            )
             count = np.array(values["count"], dtype=int)
             cause, joint, size = values["reported"]
             reported = str(cause), joint, as_array("reported", np.array(size, dtype=float), (None,))
@@ -214,11 +275,14 @@ class MovingObserver:
         self._reported, self._tested = reported, None
         return True
 
-    def _test(self) -> MotionTest | None:
+    def _angle(self, position: Array) -> Array:
+        return np.asarray(self._position_gain * position + self._position_offset)
+
+    def _test(self) -> ChangeTest | None:
         """The test of the latest rows; None while there are too few."""
         rows = (self._recent + self._block)[-LONGEST:]
         if len(rows) < LONGEST_WINDOW // 2:
             return None
         if self._tested is None or self._tested[0] != self.rows:
-            self._tested = (self.rows, MotionTest(self._belief, rows))
+            self._tested = (self.rows, ChangeTest(self._belief, rows))
         return self._tested[1]

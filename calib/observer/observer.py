@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest
-from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, NOISE_SHARE, ObserverConfig
+from calib.observer.cause_test import CauseTest, DetectionLimits
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing, DriftFinding, Event, decide, verdict_evidence, windows_agree
 from calib.observer.discrepancy import DiscrepancyLevel
-from calib.observer.evidence import DetectionLimits, Verdict
+from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.investigation import Investigation
+from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed, may_adapt
 from calib.observer.moving_observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.saved_values import UNREADABLE, restored
@@ -31,12 +31,6 @@ SCHEMA = 1
 DISCREPANCY_SHARE = 5e-4
 """Discrepancy of the gravity model expected before the first row, as a share of rated torque; if the calibration says
 how large it is, that counts."""
-POSITION_STD = 1e-3
-"""Standard deviation of a position sensor's zero [rad]; marginalised like the model's error."""
-DOUBTED = 2
-"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them.
-
-An alarm is open, or the first epoch of the reference."""
 PATIENCE = 2 * LONGEST_WINDOW
 """Repeated poses after an alarm after which the test is given up as undecided: as many as two longest windows have."""
 
@@ -49,7 +43,7 @@ class Observer:
         arm: Arm,
         beta: Array,
         beta_covariance: Array,
-        rated_torque: Array,
+        sigma: Array,
         config: ObserverConfig | None = None,
         position_gain: Array | None = None,
         position_offset: Array | None = None,
@@ -57,19 +51,22 @@ class Observer:
     ) -> None:
         """Watch an arm.
 
-        beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; rated_torque (n,) [N·m] scales
-        what is assumed at first; position gains and offsets (n,) of the calibration record; level of the discrepancy
-        that the calibration left, if it said.
+        beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
+        deviation of one averaged torque reading to begin with, replaced by the measured one; position gains and offsets
+        (n,) of the calibration record; level of the discrepancy that the calibration left, if it said.
         """
         self.arm, self.config = arm, config or ObserverConfig()
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
-        rated = np.asarray(rated_torque, dtype=float)
+        rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
         expected = level or DiscrepancyLevel.expected(DISCREPANCY_SHARE * rated)
-        belief = GravityBelief(arm, beta, beta_covariance, POSITION_STD, expected, self.config.zero_wander * rated)
-        self._tracking = Tracking(belief, NOISE_SHARE * rated, self.config.window)
-        self._investigation = Investigation(arm.n, self.config.window)
+        wander = settings.zero_wander * rated
+        belief = GravityBelief(
+            arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
+        )
+        self._tracking = Tracking(belief, sigma, self.config)
+        self._investigation = Investigation(arm.n, self.config)
         self._proposed = np.full(arm.n, -np.inf)
         self._limits: tuple[tuple[int, ...], DetectionLimits] | None = None
 
@@ -80,7 +77,7 @@ class Observer:
     @property
     def accepted(self) -> Array:
         """Rows that went into each joint's estimate (n,)."""
-        return self._tracking.accepted.copy()
+        return self._tracking.filter.accepted.copy()
 
     @property
     def held(self) -> bool:
@@ -96,10 +93,12 @@ class Observer:
         rated_torque: Array,
         config: ObserverConfig | None = None,
     ) -> "Observer":
-        """Observer against these records; rated_torque (n,) [N·m] scales what is assumed at first."""
+        """Observer against these records; rated_torque (n,) [N·m] scales the noise assumed at first."""
+        config = config or ObserverConfig()
+        sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
         level = DiscrepancyLevel.of_record(calibration, DISCREPANCY_SHARE * np.asarray(rated_torque, dtype=float))
-        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), rated_torque, config, *position, level)
+        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
         """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none.
@@ -116,22 +115,22 @@ class Observer:
         row = replace(row, position=self._angle(row.position))
         if not self._tracking.count(row):
             return []
-        state = self._investigation
-        alarms = [] if state.held else self._tracking.watch(row, state.window)
+        alarms = [] if self._investigation.held else self._tracking.watch(row)
         if alarms:
-            state.start()
-            return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
-        if not state.add(row):
+            told = [alarm for alarm in alarms if alarm[0] != "suspicion"]
+            self._investigation.start(silent=not told)
+            return [self._event(row.t, kind, joint, **evidence) for kind, joint, evidence in told]
+        if not self._investigation.add(row):
             return self._repeat(row.t)
-        if not state.is_due():
+        if not self._investigation.is_due():
             return []
-        if state.held:
+        if self._investigation.held:
             return self._test(row.t)
-        self._audit()
+        audit(self._tracking, self._investigation, self.config)
         return []
 
     def estimate(self) -> Estimate:
-        return self._tracking.estimate()
+        return self._tracking.filter.estimate()
 
     def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, at poses like the latest ones."""
@@ -170,63 +169,17 @@ class Observer:
     def _angle(self, position: Array) -> Array:
         return np.asarray(self._position_gain * position + self._position_offset)
 
-    def _adapted(self, rows: list[StaticReading], patient: bool) -> tuple[CauseTest, Verdict]:
-        """The cause test of rows and its verdict; where nothing explains them, again with the discrepancy adapted to
-        them, unless one is still `patient`."""
-        test = self._tracking.cause_test(rows)
-        verdict = test.verdict()
-        if verdict.cause == "unknown" and not patient:
-            self._tracking.belief.adapt(rows, self._tracking.sigma)
-            test = self._tracking.cause_test(rows)
-            verdict = test.verdict()
-        return test, verdict
-
-    def _audit(self) -> None:
-        """Without an alarm, test the last rows for effects too small or too slow for one: an effect opens a silent
-        investigation, rows free of any become reference."""
-        state, tracking = self._investigation, self._tracking
-        window = state.window[-LONGEST_WINDOW:]
-        if not tracking.belief.learnt:
-            if len(window) < self.config.window:
-                return
-            # a change in the newest rows is not discrepancy
-            tracking.belief.adapt(window[: -len(window) // 4], tracking.sigma)
-        # longer than a change takes to fill the window; an alarm would be open if it were a contact
-        patience = DOUBTED if tracking.belief.is_first else LONGEST_WINDOW // AUDIT_ROWS + 1
-        test, verdict = self._adapted(window, state.doubtful + 1 < patience)
-        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
-        if verdict.cause == "none":
-            tracking.follow(test)
-            tracking.belief.learn(state.settled(tracking.belief.is_first), tracking.sigma)
-            return
-        del state.window[:-LONGEST_WINDOW]
-        state.learned = min(state.learned, len(state.window))
-        if verdict.cause not in ("unknown", "ambiguous"):  # an alarm follows if those last
-            state.start(silent=True)
-
-    def _is_confirmed(self, test: CauseTest, verdict: Verdict) -> bool:
-        """Whether fresh rows twice find what an audit was about; nothing is told before."""
-        state = self._investigation
-        if verdict.cause in ("none", "unknown", "ambiguous"):
-            if len(state.window) >= LONGEST_WINDOW:
-                self._resume()
-            return False
-        suspected, state.suspected = state.suspected, ("drift" if verdict.is_drift else verdict.cause, verdict.joints)
-        if suspected == state.suspected:
-            return True
-        state.first = Agreeing(state.window, test, frozenset(verdict.joints)) if verdict.is_drift else None
-        state.window = []
-        return False
-
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state = self._investigation
-        # more rows than a contact, for which an alarm is open, or none to compare them with, show the discrepancy
-        patient = self._tracking.belief.learnt > 0 and len(state.window) < DOUBTED * self.config.window
-        test, verdict = self._adapted(state.window, patient or not state.silent)
+        test = self._tracking.cause_test(state.window)
+        if state.silent and test.verdict().cause == "unknown" and may_adapt(self._tracking, state.window, self.config):
+            self._tracking.adapt(state.window)
+            test = self._tracking.cause_test(state.window)
+        verdict = test.verdict()
         if verdict.cause == "ambiguous" and len(state.window) < LONGEST_WINDOW:
             return []  # more rows may decide
-        if state.silent and not self._is_confirmed(test, verdict):
+        if state.silent and not is_confirmed(self._tracking, state, test, verdict):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -234,7 +187,9 @@ class Observer:
         if state.doubtful == 1:
             return []  # the cause may have changed within this window: wait for another one
         if state.doubtful > DOUBTED:  # it stays: another discrepancy than the one known
-            test, verdict = self._adapted(window, patient=False)
+            self._tracking.adapt(window)
+            test = self._tracking.cause_test(window)
+            verdict = test.verdict()
         if verdict.cause == "none":
             self._resume()
             return [self._verdict(t, verdict)]
@@ -255,7 +210,7 @@ class Observer:
         off = belief.mass > 0 and abs(mass + belief.mass) < 0.05 * belief.mass + 5 * std
         if state.carrying < self.config.tool_windows and not off:
             return []
-        belief.carry(verdict.values, verdict.covariance)
+        self._tracking.carry(verdict.values, verdict.covariance)
         self._resume()
         return [self._verdict(t, replace(verdict, cause="tool", joint=None))]
 
@@ -264,7 +219,8 @@ class Observer:
         first, agreeing = self._investigation.first, Agreeing(window, test, frozenset(verdict.joints))
         self._investigation.first = agreeing
         for joint in verdict.joints:
-            self._tracking.restart(joint, *test.drift(joint, verdict.cause, verdict.other(joint)))
+            change, covariance = test.drift(joint, verdict.cause, verdict.other(joint))
+            self._tracking.filter.restart(joint, 1 + change[0], change[1], covariance)
         if first is None or first.joints != agreeing.joints:
             return []
         for joint in verdict.joints:
@@ -287,7 +243,7 @@ class Observer:
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
         """The estimate from all rows that agree, as a proposal or with the reasons against one."""
         finding = decide(test, verdict, joint, self.config)
-        self._tracking.restart(joint, np.array([finding.gain - 1, finding.offset]), finding.covariance)
+        self._tracking.filter.restart(joint, finding.gain, finding.offset, finding.covariance)
         if finding.refused:
             return self._undecided(t, joint, *finding.refused)
         if t - self._proposed[joint] < self.config.rest_between_writes:

@@ -18,7 +18,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.install.check_motion import WORSE
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
-from calib.observer.config import NOISE_SHARE, ObserverConfig, Policy
+from calib.observer.config import ObserverConfig, Policy
 from calib.observer.decision import DriftFinding
 from calib.observer.rest_detector import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
@@ -54,10 +54,11 @@ class AfterWrite:
         """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.carrying(arm).beta)
         self._record = record
-        self._rests = RestDetector(len(record.joints), ObserverConfig())
+        config = ObserverConfig()
+        self._rests = RestDetector(len(record.joints), config)
         self._joints, self._names = list(old), [record.joints[j].name for j in old]
         self._pairs = [(old[j], new[j]) for j in old]
-        self._floor = NOISE_SHARE / 2 * arm.require_link().rated_torques[self._joints]
+        self._floor = config.noise_share / 2 * arm.require_link().rated_torques[self._joints]
         """Difference in RMS that does not count [N·m]: half of the scatter of one rest's average."""
         self._before: list[list[float]] = []
         self._after: list[list[float]] = []

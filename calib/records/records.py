@@ -248,12 +248,11 @@ class CalibrationRecord(ArmRecord):
         found = [each.discrepancy for each in self.joints]
         return np.array([missing if each is None else getattr(each, key) for each in found])
 
-    def std(self, parameter: Parameter, missing: float | Array = np.nan) -> Array:
-        """Standard deviations of one parameter of all joints (n,); `missing` for those not estimated."""
+    def std(self, parameter: Parameter) -> Array:
+        """Standard deviations of one parameter of all joints (n,); NaN for those not estimated."""
         place = {name: index for index, name in enumerate(self.covariance_of)}
         names = [f"{joint.name}.{parameter}" for joint in self.joints]
-        found = np.array([self.covariance[place[n]][place[n]] ** 0.5 if n in place else np.nan for n in names])
-        return np.where(np.isnan(found), missing, found)
+        return np.array([self.covariance[place[n]][place[n]] ** 0.5 if n in place else np.nan for n in names])
 
 
 class GravityRecord(ArmRecord):

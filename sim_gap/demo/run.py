@@ -270,8 +270,8 @@ class Demo:
         recalibrator = Recalibrator(bench.arm, link, self.store, "apply")
         with account.stage("ordinary work, during which a torque sensor will drift") as screen:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
-        alarm = history.first("alarm", name, began)
-        noticed = None if alarm is None else alarm - began
+        times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, name, began)) is not None]
+        noticed = min(times, default=None)
         made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name and done.applied]
         written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written

@@ -9,8 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.static_reading import StaticReading
-from calib.observer.motor_belief import WIDTH, passage
+from calib.observer.motor_belief import WIDTH, Passage
 from calib.records.records import CalibrationRecord
 
 SPEEDS = (0.1, 0.6)
@@ -38,13 +37,13 @@ NOTHING = Change()
 def work(
     arm: ArmFile, made: DrawnCreep, record: CalibrationRecord, random: np.random.Generator, rows: int,
     change: Change = NOTHING,
-) -> list[StaticReading]:  # fmt: skip
+) -> list[Passage]:  # fmt: skip
     """So many passages of motions of one to three joints at a time between random poses; time goes on from motion to
     motion. Readings are corrected by the record, positions are true angles by it."""
     simulated = made.simulated
     described = gcomp_arm(arm)
     limits = np.stack([described.lower, described.upper], axis=1)
-    n, found = described.n, list[StaticReading]()
+    n, found = described.n, list[Passage]()
     simulated.attach_mass(change.payload)
     zero = record.values("position_offset", 0.0)
     held = record.torque_calibration(TorqueCalibration(np.ones(n), np.zeros(n)))
@@ -64,7 +63,7 @@ def work(
                 corrected = (torque - held.offset[joint]) / held.gain[joint]
                 heat = float(np.floor(simulated.sensors.heating(t)[joint]))
                 position = q + zero
-                found.append(passage(t, int(joint), position, corrected, float(velocity[joint]), heat))
+                found.append(Passage(t, int(joint), position, corrected, float(velocity[joint]), heat))
         simulated.time += seconds + PAUSE
         here = goal
     simulated.attach_mass(0.0)

@@ -1,11 +1,15 @@
 """Settings of the cause test, and a payload added to readings."""
 
+from dataclasses import replace
+
 from calib.observer.config import ObserverConfig
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
 
 SIGMA = 0.05
-CONFIG = ObserverConfig()
+
+
+CONFIG = replace(ObserverConfig(), position_std=0.0)
 
 
 def payload(mass):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.config import NOISE_SHARE, ObserverConfig
+from calib.observer.config import ObserverConfig
 from calib.observer.decision import Event
 from calib.observer.observer import Observer
 from gcomp.arm.arm import Arm
@@ -13,7 +13,6 @@ from gcomp.gravity.torque import gravity_torque
 
 SIGMA = np.array([0.04, 0.04, 0.02, 0.02, 0.01, 0.01, 0.004])
 """Torque noise of 0.2 % of rated torque, averaged over 0.2 s at 250 Hz."""
-RATED = SIGMA / NOISE_SHARE
 MODEL_STD = np.repeat([4.4, 4.5, 1.3, 0.9, 0.5, 0.4, 0.3], 2) * 1e-3
 POSE_SECONDS = 2.0
 
@@ -26,7 +25,7 @@ class Bench:
         scale = 1 + 3e-3 * self.random.normal()  # common to calibration and model: nobody can see it
         covariance = np.diag(MODEL_STD**2) + 9e-6 * np.outer(beta, beta)
         model = (beta + MODEL_STD * self.random.normal(size=beta.size)) * scale
-        self.observer = Observer(arm, model, covariance, RATED, config)
+        self.observer = Observer(arm, model, covariance, SIGMA, config)
         self.scale = scale
         self.gain, self.offset = np.ones(arm.n), np.zeros(arm.n)
         """Of the readings as installed."""

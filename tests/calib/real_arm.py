@@ -90,4 +90,5 @@ class RealArm(RestArm):
         """With the level that the calibration tells, if it does."""
         config = config or ObserverConfig()
         level = DiscrepancyLevel.expected(self.level, np.full(self.n, 0.5)) if told else None
-        return Observer(self.arm, self.model, self.covariance, self.rated, config, level=level)
+        sigma = config.noise_share * self.rated
+        return Observer(self.arm, self.model, self.covariance, sigma, config, level=level)

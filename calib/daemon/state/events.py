@@ -141,6 +141,8 @@ def describe(event: Event) -> Description:
     joint, evidence = event.joint or "the arm", event.evidence
     if event.kind == "alarm":
         return "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})", evidence
+    if event.kind == "outliers":
+        return "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model", evidence
     if event.kind == "undecided":
         return (
             "undecided",

@@ -11,11 +11,10 @@ from effects_on_readings import SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
 from calib.observer.cause_test import CauseTest, dictionary
-from calib.observer.evidence import Verdict
+from calib.observer.evidence import Verdict, smallest_noticed_change, span
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
-from gcomp.estimate.explanation import smallest_noticed_change, span
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness, gravity_torque
 from gcomp.identify.readings import StaticReadings
 

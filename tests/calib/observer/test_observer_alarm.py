@@ -1,48 +1,43 @@
-"""Rest detection and alarm, against the figures of docs/theory.md, section 6."""
+"""Rest detection, filter and alarm, against the figures of docs/theory.md, section 6."""
 
 from dataclasses import replace
-from itertools import cycle
 
 import numpy as np
 import pytest
-from real_arm import RealArm
 from rest_arm import RestArm
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.config import ObserverConfig
+from calib.observer.config import INITIAL_GAIN_STD, ObserverConfig
 from calib.observer.rest_detector import RestDetector
-from calib.observer.tracking import ALARM_THRESHOLD, change_ratios
+from calib.observer.tracking import Cusum, SensorFilter
 from gcomp.gravity.torque import gravity_torque
 
 CONFIG = ObserverConfig()
-WINDOW = CONFIG.window
 SIGMA = 0.05
-MEDIANS = [2, 2, 5, 6]
-"""Rows until 1 % of gain is an alarm, joints 1 to 4; on the others it takes more rows than are judged together."""
 PERIOD = 0.004
 
 
-def rows_to_alarm(arm, beta, gain, offset, joint, random, most=100) -> tuple[int, int]:
-    """Rows until the first alarm of a drifted joint, and which joint it names; noise before the drift."""
-    torque = gravity_torque(arm, beta, random.uniform(arm.lower, arm.upper, (WINDOW + most, arm.n)))
+def rows_to_alarm(arm, beta, gain, offset, joint, random, most=4000) -> tuple[int, int]:
+    """Rows until the first alarm of a drifted joint, and which joint it names."""
+    cusum = Cusum(arm.n, CONFIG)
+    torque = gravity_torque(arm, beta, random.uniform(arm.lower, arm.upper, (most, arm.n)))
     residual = SIGMA * random.normal(size=torque.shape)
-    residual[WINDOW:, joint] += gain * torque[WINDOW:, joint] + offset
-    covariance = np.tile(SIGMA**2 * np.eye(WINDOW), (arm.n, 1, 1))
-    for count in range(1, most + 1):
-        rows = slice(count, count + WINDOW)
-        ratio = change_ratios(residual[rows], torque[rows], covariance)[0].max(axis=(1, 2))
-        if ratio.max() > ALARM_THRESHOLD:
-            return count, int(ratio.argmax())
+    residual[:, joint] += gain * torque[:, joint] + offset
+    for count, (e, tau) in enumerate(zip(residual, torque, strict=True), start=1):
+        alarms = cusum.handle(e, tau, np.full(arm.n, SIGMA**2))
+        if alarms:
+            return count, alarms[0][0]
     return most, -1
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize(("joint", "median"), list(enumerate(MEDIANS)))
+@pytest.mark.parametrize(("joint", "median"), list(enumerate([2, 2, 5, 5, 89, 32, 797])))
 def test_a_gain_drift_of_1_percent_raises_an_alarm_as_soon_as_the_theory_says(
     sarcos, sarcos_beta, joint, median
 ) -> None:
     random = np.random.default_rng(joint)
-    counts = [rows_to_alarm(sarcos, sarcos_beta, 0.01, 0.0, joint, random)[0] for _ in range(60)]
+    trials = 60 if median < 100 else 25
+    counts = [rows_to_alarm(sarcos, sarcos_beta, 0.01, 0.0, joint, random)[0] for _ in range(trials)]
     assert abs(np.median(counts) - median) <= max(1, 0.3 * median)
 
 
@@ -55,34 +50,47 @@ def test_an_offset_drift_raises_an_alarm_within_3_rows_and_names_the_joint(sarco
     assert np.mean([named == joint for _, named in results]) > 0.95
 
 
-@pytest.mark.parametrize("rows", [10_000, pytest.param(60_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("rows", [20_000, pytest.param(60_000, marks=pytest.mark.long)])
 def test_false_alarms_are_rarer_than_one_in_5000_rows(sarcos, sarcos_beta, rows) -> None:
     random = np.random.default_rng(9)
     torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (rows, 7)))
-    noise, alarms, quiet = SIGMA * random.normal(size=torque.shape), 0, 0
-    covariance = np.tile(SIGMA**2 * np.eye(WINDOW), (7, 1, 1))
-    for last in range(WINDOW, rows):
-        seen = slice(last - WINDOW, last)
-        if last >= quiet and change_ratios(noise[seen], torque[seen], covariance)[0].max() > ALARM_THRESHOLD:
-            alarms, quiet = alarms + 1, last + WINDOW
+    noise, cusum, alarms = SIGMA * random.normal(size=torque.shape), Cusum(7, CONFIG), 0
+    for e, tau in zip(noise, torque, strict=True):
+        if cusum.handle(e, tau, np.full(7, SIGMA**2)):
+            alarms += 1
+            cusum.reset()
     assert alarms < rows / 5000
 
 
-def test_the_ratio_and_the_size_of_a_change_are_those_of_least_squares() -> None:
-    random = np.random.default_rng(3)
-    residual, torque = random.normal(size=(2, 6, 2))
-    root = random.normal(size=(2, 6, 6))
-    covariance = root @ root.swapaxes(1, 2) + np.eye(6)
-    ratio, size = change_ratios(residual, torque, covariance)
-    for joint, start in ((0, 0), (1, 2), (1, 5)):
-        weight = np.linalg.inv(covariance[joint])
-        for channel, change in enumerate((torque[:, joint], np.ones(6))):
-            column = np.where(np.arange(6) >= start, change, 0.0)
-            best = column @ weight @ residual[:, joint] / (column @ weight @ column)
-            left = residual[:, joint] - best * column
-            fall = residual[:, joint] @ weight @ residual[:, joint] - left @ weight @ left
-            assert size[joint, channel, start] == pytest.approx(best)
-            assert ratio[joint, channel, start] == pytest.approx(fall / 2)
+def test_the_filter_tracks_to_the_accuracy_of_its_random_walk(sarcos, sarcos_beta) -> None:
+    """Steady state of docs/theory.md, section 6: std(o) about 0.007 N·m, std(k) 0.044 … 0.12 % on joints 1 to 6."""
+    random = np.random.default_rng(2)
+    torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (900, 7)))
+    tracked = SensorFilter(7, replace(CONFIG, gain_std=1.0))  # the figures are without the excitation gate
+    errors = []
+    for tau in torque:
+        tracked.handle(1.003 * tau - 0.04 + SIGMA * random.normal(size=7), tau, np.full(7, SIGMA**2))
+        errors.append(tracked.state - (1.003, -0.04))
+    rms = np.sqrt(np.mean(np.array(errors[400:]) ** 2, axis=0))
+    assert (rms[:, 1] < 0.012).all()
+    assert (rms[:6, 0] < 1.5 * np.array([0.044, 0.045, 0.066, 0.069, 0.15, 0.12]) / 100).all()
+
+
+def test_a_joint_without_excitation_keeps_its_gain(sarcos, sarcos_beta) -> None:
+    tracked = SensorFilter(7, CONFIG)
+    torque = gravity_torque(sarcos, sarcos_beta, np.zeros((1, 7)))[0]
+    for _ in range(300):
+        tracked.handle(torque + 0.05, torque, np.full(7, SIGMA**2))
+    np.testing.assert_array_equal(tracked.state[:, 0], 1.0)
+    assert (np.abs(tracked.state[:, 1] - 0.05) < 3 * np.sqrt(tracked.covariance[:, 1, 1])).all()
+    np.testing.assert_allclose(tracked.covariance[:, 0, 0], INITIAL_GAIN_STD**2)
+
+
+def test_an_outlier_is_not_taken_and_is_counted(sarcos) -> None:
+    tracked, torque = SensorFilter(7, CONFIG), np.zeros(7)
+    tracked.handle(torque + 5.0, torque, np.full(7, SIGMA**2))
+    np.testing.assert_array_equal(tracked.state[:, 1], 0.0)
+    np.testing.assert_array_equal(tracked.rejected, 1)
 
 
 def run_detector(positions: np.ndarray, torques: np.ndarray, config: ObserverConfig = CONFIG) -> list[StaticReading]:
@@ -154,16 +162,3 @@ def test_a_row_in_which_a_motion_began_is_none_and_an_arm_that_is_noisier_is_wat
         observer.handle_row(replace(rest, torque_error=np.abs(noisier * arm.random.normal(size=7))))
     assert observer.rows > rows + 10
     np.testing.assert_array_less(5 * sigma, observer._tracking.sigma)
-
-
-@pytest.mark.parametrize("drift", [0.0, 0.03])
-def test_among_three_poses_a_drift_raises_an_alarm_and_the_model_s_error_does_not(drift: float) -> None:
-    """The discrepancy is the same at each visit; the drift is a share of rated torque, reached in 240 stops."""
-    arm = RealArm("sarcos", 1, 3)
-    observer = arm.observer()
-    arm.job = cycle(np.random.default_rng(3).uniform(arm.arm.lower, arm.arm.upper, (3, 7)))
-    events = arm.work(observer, 60)
-    for _ in range(40):
-        arm.offset[1] += drift / 240 * arm.rated[1]
-        events += arm.work(observer, 1)
-    assert {event.joint for event in events if event.kind == "alarm"} == ({"joint_2"} if drift else set())

@@ -8,7 +8,7 @@ from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.observer.cause_test import CauseTest
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.tracking import ALARM_THRESHOLD, change_ratios
+from calib.observer.tracking import Cusum
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 from gcomp.identify.readings import StaticReadings
@@ -25,10 +25,9 @@ def cause_of_pickup(arm, beta, mass, random) -> str:
     reading = torque.copy()
     payload(mass)(arm, beta, q, None, reading, random)
     reading += SIGMA * random.normal(size=q.shape)
+    cusum, variance = Cusum(arm.n, CONFIG), np.full(arm.n, SIGMA**2)
     for row in range(WATCHED):
-        latest = slice(max(0, row + 1 - CONFIG.window), row + 1)
-        covariance = np.tile(SIGMA**2 * np.eye(latest.stop - latest.start), (arm.n, 1, 1))
-        if change_ratios((reading - torque)[latest], torque[latest], covariance)[0].max() > ALARM_THRESHOLD:
+        if cusum.handle(reading[row] - torque[row], torque[row], variance):
             break
     else:
         return "no alarm"

@@ -5,8 +5,8 @@ import pytest
 from effects_on_readings import SIGMA, payload
 
 from calib.observer.cause_test import CauseTest
+from calib.observer.evidence import smallest_noticed_change
 from calib.observer.gravity_belief import GravityBelief
-from gcomp.estimate.explanation import smallest_noticed_change
 from gcomp.gravity.torque import gravity_torque
 from gcomp.identify.readings import StaticReadings
 

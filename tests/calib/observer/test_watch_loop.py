@@ -30,7 +30,7 @@ MASS = np.array([4.0, 3.0, 1.5])
 CENTRE = np.array([[0.0, 0.0, -0.1], [0.2, 0.02, 0.0], [0.15, 0.0, 0.01]])
 PERIOD = 0.02
 """Of the made-up link; the simulated arm has its own 0.004 s."""
-QUICK = ObserverConfig(window=12)
+QUICK = ObserverConfig(window=12, baseline_rows=24)
 
 
 def arm_file(gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)) -> ArmFile:

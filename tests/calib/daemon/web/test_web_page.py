@@ -21,7 +21,7 @@ from calib.records.records import CalibrationRecord
 
 PATIENCE = 60_000
 """Playwright's own waits end here [ms]; nothing waits so long where the machine is not overloaded."""
-QUICK = {"window": 12}
+QUICK = {"window": 12, "baseline_rows": 24}
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,11 @@ from calib.arm.kinematics import gcomp_arm
 from calib.daemon.state.events import describe
 from calib.fit.creep_fit import fit_rows
 from calib.observer.decision import Event
-from calib.observer.evidence import ChangeTest
-from calib.observer.moving_observer import MotionTest, MovingObserver
+from calib.observer.evidence import ChangeHypothesis, ResidualTest
+from calib.observer.moving_observer import ChangeTest, MovingObserver
 from calib.observer.observer import Observer, observer_of
 from calib.plan.creep_plan import plan_creep
 from calib.records.records import CalibrationRecord, GravityRecord
-from gcomp.estimate.explanation import ChangeHypothesis, ResidualTest
 
 SEED = 4
 """Four joints, the first upright."""
@@ -85,11 +85,10 @@ def test_a_change_is_told_as_what_it_is(change: Change, joint: str | None, cause
 @pytest.mark.parametrize(("size", "cause"), [(0.0, "none"), (5.0, "gain")])
 def test_a_change_that_hardly_explains_the_rows_is_none(size: float, cause: str) -> None:
     """Fifty rows of whitened noise, and a gain's column in them."""
-    random = np.random.default_rng(6)
+    random, test = np.random.default_rng(6), ChangeTest.__new__(ChangeTest)
     gain = ChangeHypothesis("gain", 0, random.standard_normal((50, 1)))
-    rows = ResidualTest(random.standard_normal(50) + size * gain.columns[:, 0], np.eye(50), [gain])
-    test = MotionTest.__new__(MotionTest)
-    ChangeTest.__init__(test, rows, 0.5, 0.0)
+    test._belief, test._passages = SimpleNamespace(learnt=range(100)), [None] * 50  # type: ignore[assignment, list-item]
+    test.found = ResidualTest(random.standard_normal(50) + size * gain.columns[:, 0], np.eye(50), [gain])
     assert test.verdict().cause == cause
 
 

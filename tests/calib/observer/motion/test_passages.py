@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calib.observer.motor_belief import WIDTH, PassageDetector, read_passages, save_passages
+from calib.observer.motor_belief import WIDTH, Passage, PassageDetector
 
 PERIOD = 0.02
 
@@ -15,10 +15,6 @@ def rows_of(position, torque=None, period=PERIOD):
     detector = PassageDetector(position.shape[1])
     pull = np.zeros_like(position) if torque is None else torque
     return [row for k in range(len(position)) for row in detector.handle(k * period, position[k], pull[k])]
-
-
-def velocity(row):
-    return row.direction[row.joint] * row.speed
 
 
 def ramp(speed, seconds=10.0, start=0.0):
@@ -32,8 +28,8 @@ def test_a_joint_at_constant_speed_gives_a_row_every_tenth_of_a_radian():
     assert 17 <= len(rows) <= 19  # 2 rad, less what friction takes to turn round
     assert {row.joint for row in rows} == {0}
     for row in rows:
-        assert velocity(row) == pytest.approx(0.2, rel=1e-6)
-        assert row.torque[0] == pytest.approx(5 + 2 * row.position[0], abs=1e-9)
+        assert row.velocity == pytest.approx(0.2, rel=1e-6)
+        assert row.torque == pytest.approx(5 + 2 * row.position[0], abs=1e-9)
         assert row.position[1] == pytest.approx(0.3)
     assert np.diff([row.position[0] for row in rows]) == pytest.approx(WIDTH, abs=0.01)
 
@@ -41,7 +37,7 @@ def test_a_joint_at_constant_speed_gives_a_row_every_tenth_of_a_radian():
 def test_two_joints_that_move_give_a_row_each():
     rows = rows_of(np.column_stack([ramp(0.2), ramp(-0.1)]))
     assert [row.joint for row in rows[-2:]] == [0, 1]
-    assert velocity(rows[-1]) == pytest.approx(-0.1)
+    assert rows[-1].velocity == pytest.approx(-0.1)
 
 
 def test_rest_acceleration_and_creep_below_friction_s_speed_give_none():
@@ -55,10 +51,10 @@ def test_rest_acceleration_and_creep_below_friction_s_speed_give_none():
 def test_after_a_reversal_friction_turns_round_first():
     there = np.concatenate([ramp(0.2, 5), 1.0 - ramp(0.2, 5)])
     rows = rows_of(np.column_stack([there, 0 * there]))
-    back = [row.position[0] for row in rows if velocity(row) < 0]
+    back = [row.position[0] for row in rows if row.velocity < 0]
     assert back
     assert max(back) < 1.0 - WIDTH / 2 - 0.02
-    assert {np.sign(velocity(row)) for row in rows} == {1, -1}
+    assert {np.sign(row.velocity) for row in rows} == {1, -1}
 
 
 def test_a_gap_in_the_samples_begins_again():
@@ -72,9 +68,9 @@ def test_a_gap_in_the_samples_begins_again():
 
 def test_rows_are_saved_as_json():
     (row,) = rows_of(np.column_stack([ramp(0.2, 1.6), ramp(0.0, 1.6)]))[:1]
-    (read,) = read_passages(json.loads(json.dumps(save_passages([row]))), 2)
+    read = Passage.from_json(json.loads(json.dumps(row.to_json())), 2)
     assert read.joint == row.joint
-    assert velocity(read) == velocity(row)
-    assert np.isnan(read.temperature).all()
+    assert read.velocity == row.velocity
+    assert np.isnan(read.temperature)
     with pytest.raises(ValueError, match="joint 5"):
-        read_passages([[5, [0.0, 0.0], 0.0, 0.1, None]], 2)
+        Passage.from_json([5, [0.0, 0.0], 0.0, 0.1, None], 2)
