@@ -165,6 +165,18 @@ def test_a_prompt_is_not_overwritten_by_a_spinner():
     assert "verdict: both" in after
 
 
+def test_a_question_stays_where_the_spinner_had_two_lines():
+    long = ASKS.replace('"working"', '"working " * 10')
+    _, _, after = on_terminal([sys.executable, "-c", long], "Which arm?", "both")
+    assert "\x1b[1A" not in after.partition("working")[0], "a line above the spinner is erased"
+
+
+def test_a_table_that_was_watched_leaves_nothing_behind():
+    command = [sys.executable, "-m", "armlink.cli", "monitor", "sarcos", "--sync", "--cycles", "1"]
+    said = "".join(on_terminal(command, "joints are heard", "nothing is asked"))
+    assert said.count("sarcos on simulated arm") == 2, "once while watching, once at the end"
+
+
 def test_a_question_leaves_standard_output_alone(tmp_path):
     with (tmp_path / "out").open("w") as out:
         on_terminal([sys.executable, "-c", ASKS], "Which arm?", "both", stdout=out)

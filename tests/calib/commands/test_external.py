@@ -84,6 +84,14 @@ def test_a_push_is_found_and_free_motion_is_quiet(workplace, capsys):
     assert told == pytest.approx(8.0, abs=1.5)
 
 
+def test_a_model_file_alone_is_not_called_records(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    assert run(["external", "arm.xml", "quiet.csv", "--out", "alone.csv"]) == 0
+    said = capsys.readouterr()
+    assert "follow from the model file alone" in said.err
+    assert "alone.csv is written" in said.out
+
+
 def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     monkeypatch.chdir(workplace)
     joints = [
@@ -105,7 +113,7 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     out = capsys.readouterr()
     answer = json.loads(out.out)
     assert answer["baseline_s"] == 0.0
-    assert "by the records alone" in out.err
+    assert "follow from the records alone" in out.err
     assert Path("felt.svg").read_text().startswith("<svg")
 
 
