@@ -77,9 +77,10 @@ def external(
     console, answers = results(json_file), []
     every: list[Heard] = []
     if not free:
+        recorded = records.gravity is not None or records.calibration is not None
         PlainConsole().print(
-            f"the bounds follow from the {'model file' if records.stated.arm_file is None else 'records'} alone, and "
-            "were not checked on work of the arm: give recordings without contact as --baseline",
+            f"the bounds follow from the {'records' if recorded else 'model'} alone, and were not checked on work of "
+            "the arm: give recordings without contact as --baseline",
             style="yellow",
         )
     names = records.stated.arm.names

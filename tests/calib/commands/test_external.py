@@ -88,7 +88,7 @@ def test_a_model_file_alone_is_not_called_records(workplace, monkeypatch, capsys
     monkeypatch.chdir(workplace)
     assert run(["external", "arm.xml", "quiet.csv", "--out", "alone.csv"]) == 0
     said = capsys.readouterr()
-    assert "follow from the model file alone" in said.err
+    assert "follow from the model alone" in said.err
     assert "alone.csv is written" in said.out
 
 
