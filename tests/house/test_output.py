@@ -207,6 +207,12 @@ def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_pa
     assert "-2.40 +2.40" in said
 
 
+def test_new_names_joints_that_are_set_aside_for_one_reason_in_one_line(tmp_path, capsys):
+    assert cli.run(["new", str(ROOT / "tests" / "models" / "own.xml"), "--out", str(tmp_path / "own.yaml")]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "part of the arm" in line]
+    assert said == ["2 joints are not part of the arm, since each is prismatic: slide_l, slide_r"]
+
+
 def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path):
     """Answers would be lost. The bus is looked at first, on a terminal as on a pipe."""
     shutil.copy(folder / "arm.urdf", tmp_path)
