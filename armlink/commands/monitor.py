@@ -80,12 +80,15 @@ def monitor(
             Live(console=console, auto_refresh=False, transient=True) as live,
             _stream(arm_file, foxglove, rerun, console) as send,
         ):
-            while not refreshes or shown < refreshes:
-                answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
-                answer["remarks"] = opened.said() if isinstance(opened, ListeningBus) else []
-                shown += 1
-                if console.is_terminal:
-                    live.update(_table(title, answer), refresh=True)
+            try:
+                while not refreshes or shown < refreshes:
+                    answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
+                    answer["remarks"] = opened.said() if isinstance(opened, ListeningBus) else []
+                    shown += 1
+                    if console.is_terminal:
+                        live.update(_table(title, answer), refresh=True)
+            finally:
+                live.update("")  # a table that is higher than the terminal would leave lines behind
     finally:
         opened.shutdown()
         if answer:

@@ -140,6 +140,7 @@ def _question() -> Iterator[None]:
             yield
     finally:
         for live in reversed(stopped):
+            live._live_render._shape = None  # else it erases as many lines above it as it had, such as the question
             live.start(refresh=True)
 
 

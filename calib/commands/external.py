@@ -83,15 +83,17 @@ def external(
     if learned is not None and not free:
         listener = load_learned(learned, records).listener
     else:
-        listener = listener_of(records, free, list(judged.values()))
+        with PlainConsole().status("learning what the arm does without contact"):
+            listener = listener_of(records, free, list(judged.values()))
         if learned is not None:
             save_learned(learned, Learned(listener, place, per_hour))
     console, answers = results(json_file), []
     every: list[Heard] = []
     if not free and learned is None:
+        recorded = records.gravity is not None or records.calibration is not None
         PlainConsole().print(
-            "the bounds follow from the records alone, and were not checked on work of the arm: give recordings "
-            "without contact as --baseline",
+            f"the bounds follow from the {'records' if recorded else 'model'} alone, and were not checked on work of "
+            "the arm: give recordings without contact as --baseline",
             style="yellow",
         )
     names = records.stated.arm.names
@@ -106,6 +108,7 @@ def external(
         console.print(f"{picture}: half of the workspace needs {np.median(force):.1f} N or less")
     if out is not None:
         save_heard(out, every, names, "base")
+        console.print(f"{out} is written")
     write_json(
         json_file,
         {
@@ -189,15 +192,15 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
     best, worst = answer["smallest_force"]
     far = "not determined" if worst is None else f"{worst:.1f} N"
     console.print(
-        f"{answer['seconds']:.1f} s; smallest force found at the frame: {best:.1f} N along the best direction, "
-        f"{far} along the worst"
+        f"{answer['seconds']:.1f} s judged. Smallest force at the frame that is found in 95 %: {best:.1f} N along the "
+        f"best direction, {far} along the worst"
     )
     for event in answer["events"]:
         where = f"{event['t']:9.2f} s  {event['kind']}"
         if event["kind"] == "contact":
             told = f"at link {event['link']} ({event['probability']:.0%}), at least {event['least_force']:.1f} N"
         else:
-            told = f"{event['mass']:+.2f} kg"
+            told = f"{event['mass']:+.2f} kg{' if it is a load' if event['kind'] == 'contact or load' else ''}"
         console.print(f"{where}  {told}; joints {', '.join(event['joints'])}")
     if not answer["events"]:
         console.print("no contact")

@@ -110,7 +110,7 @@ def identify_poses(
     json_file: Path | None,
 ) -> int:
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import results
+    from armlink.commands.plain_console import PlainConsole, results
     from calib.arm.model_files import write_coefficients, write_model
 
     described = stated_model(model, options.base, options.tip)
@@ -122,7 +122,8 @@ def identify_poses(
     masses = reference_masses(options.reference_mass, poses)
     if masses and not set(map(str, poses)) - set(masses):
         raise BadInput("--reference-mass: a mass hangs in all poses: give poses without it, too")
-    judged = judged_fit(described, poses, options.heldout, masses, options.gain_std, stated)
+    with PlainConsole().status("fitting mass moments, and predicting poses that were held out"):
+        judged = judged_fit(described, poses, options.heldout, masses, options.gain_std, stated)
     fit, arm_file, record = judged.fit, described.arm_file, None
     if arm_file is not None:
         kept = fit.gravity.record(arm_file)
@@ -207,6 +208,13 @@ def _show(judged: Judged, console: "PlainConsole") -> None:
     }
     print_intervals("Held-out readings: RMS error [N·m]", fit.arm.names, held, console)
     lines = [f"not determined: {each}" for each in fit.not_determined]
+    further = np.ptp(fit.readings.position, axis=0) > fit.arm.upper - fit.arm.lower
+    if further.any():
+        lines.append(
+            f"doubtful: the poses of {', '.join(np.array(fit.arm.names)[further])} go further than the limits of the "
+            "model allow: are the positions in rad (--units q=deg), and the limits of an MJCF model (without "
+            '<compiler angle="radian"/> they are degrees)?'
+        )
     worse = "failed: held-out readings are less likely with these mass moments than with the model's own"
     better = "passed: held-out readings are at least as likely with these mass moments as with the model's own"
     print_lines([*lines, better if judged.passed else worse], console=console)

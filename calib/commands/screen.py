@@ -136,7 +136,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
         columns = (f"{number} {name}" for number, name in zip(short, arm.joint_names, strict=True))
         console.print(f"columns: {', '.join(columns)}")
     signs, pressed = {cell[0] for cells in rows for cell in cells}, any(sweep.bias for sweep in plan.sweeps)
-    legend = ["↔ sweeps"]
+    legend = ["Γ/g is the share of gravity that acts on the joint", "↔ sweeps"]
     if signs & {"▲", "▼"}:
         legend.append("▲ ▼ rests on its upper or lower stop" + ", pressed with the torque [N·m]" * pressed)
     if "=" in signs:

@@ -43,7 +43,10 @@ def interval_text(value: float, half: float) -> str:
     """A value ± half of its 95 % interval; alone where that is 0."""
     if not np.isfinite(value):
         return "not observable"
-    return f"{value:.4f}\u00a0±\u00a0{half:.4f}" if half > 0 else f"{value:.4f}"
+    if not 0 < half < np.inf:
+        return f"{value:.4f}"
+    places = max(4, -int(np.floor(np.log10(half))))  # an interval is never "± 0.0000"
+    return f"{value:.{places}f}\u00a0±\u00a0{half:.{places}f}"
 
 
 def interval_table(names: Sequence[str], columns: Mapping[str, tuple[Any, Any]], caption: str = "") -> ReportTable:

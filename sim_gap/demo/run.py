@@ -270,18 +270,19 @@ class Demo:
         recalibrator = Recalibrator(bench.arm, link, self.store, "apply")
         with account.stage("ordinary work, during which a torque sensor will drift") as screen:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
-        times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, name, began)) is not None]
+        # of any joint: which one drifted is found later
+        times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, after=began)) is not None]
         noticed = min(times, default=None)
         made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name and done.applied]
         written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written
         seen = "not noticed" if noticed is None else f"noticed after {noticed:.1f} s"
         drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} in gain and {offset:+.2f} N·m in offset: {seen}"
-        error = f"the error is now {after[0]:+.2%} and {after[1]:+.3f} N·m"
+        error = f"the error is now {after[0]:+.2%} and {after[1]:+.2g} N·m"
         if made:
             half = [1.96 * float(made[-1][1].std(of)[joint]) for of in ("gain", "offset")]
             inside = "inside" if np.all(np.abs(after) <= half) else "outside"
-            error += f", {inside} its 95 % interval of ±{half[0]:.2%} and ±{half[1]:.3f} N·m"
+            error += f", {inside} its 95 % interval of ±{half[0]:.2%} and ±{half[1]:.2g} N·m"
         right = "not recalibrated" if written is None else f"recalibrated automatically after {written:.0f} s of work"
         account.find(f"{drifted}, {right}; {error}")
         truth = np.repeat([(1.0, 0.0), (1.0 + before[0], before[1]), (1.0 + after[0], after[1])], 2, axis=0).T

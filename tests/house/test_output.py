@@ -165,6 +165,18 @@ def test_a_prompt_is_not_overwritten_by_a_spinner():
     assert "verdict: both" in after
 
 
+def test_a_question_stays_where_the_spinner_had_two_lines():
+    long = ASKS.replace('"working"', '"working " * 10')
+    _, _, after = on_terminal([sys.executable, "-c", long], "Which arm?", "both")
+    assert "\x1b[1A" not in after.partition("working")[0], "a line above the spinner is erased"
+
+
+def test_a_table_that_was_watched_leaves_nothing_behind():
+    command = [sys.executable, "-m", "armlink.cli", "monitor", "sarcos", "--sync", "--cycles", "1"]
+    said = "".join(on_terminal(command, "joints are heard", "nothing is asked"))
+    assert said.count("sarcos on simulated arm") == 2, "once while watching, once at the end"
+
+
 def test_a_question_leaves_standard_output_alone(tmp_path):
     with (tmp_path / "out").open("w") as out:
         on_terminal([sys.executable, "-c", ASKS], "Which arm?", "both", stdout=out)
@@ -193,6 +205,12 @@ def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_pa
     assert said.count("or Enter") == 3, "a slip of the fingers is asked again"
     assert "expected two numbers, the lower first" in said
     assert "-2.40 +2.40" in said
+
+
+def test_new_names_joints_that_are_set_aside_for_one_reason_in_one_line(tmp_path, capsys):
+    assert cli.run(["new", str(ROOT / "tests" / "models" / "own.xml"), "--out", str(tmp_path / "own.yaml")]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "part of the arm" in line]
+    assert said == ["2 joints are not part of the arm, since each is prismatic: slide_l, slide_r"]
 
 
 def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path):

@@ -12,7 +12,7 @@ import logging
 import math
 import struct
 from collections import Counter, deque
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from armlink.arm_file import LinkSection
@@ -86,9 +86,12 @@ class JointMessageSource(Protocol):
 class SenderClock:
     """Times of messages by this machine's clock: the sender's stamps, shifted by the shortest way so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: Iterable[tuple[float, float]] = ()) -> None:
+        """`first`: stamps and arrivals of the messages that waited when listening began: their times are known apart,
+        although they arrived together."""
         self._stamp = self._arrived = self._time = -math.inf
-        self._shift = math.inf
+        told = (arrived - stamp for stamp, arrived in first if math.isfinite(stamp) and stamp != 0.0)
+        self._shift = min(told, default=math.inf)
 
     def time(self, stamp: float, arrived: float) -> float | None:
         """Time of a message [s], later than that of the message before; None if its stamp is not newer."""
@@ -211,7 +214,11 @@ class ListeningBus(InProcessBus):
         """Take messages in until there is a frame, for at most `timeout` seconds."""
         end = self._machine.now() + timeout
         while True:
-            for message in self._source.take():
+            messages = self._source.take()
+            for source in {message.source for message in messages} - self._clocks.keys():
+                first = ((each.stamp, each.arrived) for each in messages if each.source == source)
+                self._clocks[source] = SenderClock(first)
+            for message in messages:
                 self._take_message(message)
             now = self._machine.now()
             if self._frames or now >= end:
@@ -230,7 +237,7 @@ class ListeningBus(InProcessBus):
             self._remark(f"two publishers send {twice}: the first one counts")
         if not owned:
             return
-        time = self._clocks.setdefault(message.source, SenderClock()).time(message.stamp, message.arrived)
+        time = self._clocks[message.source].time(message.stamp, message.arrived)
         if time is None:
             self._remark("messages came late or twice: their time stamps are no newer than those before")
             return

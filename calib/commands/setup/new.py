@@ -197,8 +197,12 @@ def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
         stops = "from the model" if planned.stops is None else f"{planned.stops[0]:+.2f} {planned.stops[1]:+.2f}"
         table.add_row(joint.name, joint.settings.address, stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")
     console.print(table)
-    for name, why in draft.aside:
-        console.print(f"joint {name} {why}, so it is not part of the arm")
+    for why in dict.fromkeys(why for _, why in draft.aside):
+        names = [name for name, reason in draft.aside if reason == why]
+        if len(names) == 1:
+            console.print(f"joint {names[0]} {why}, so it is not part of the arm")
+        else:
+            console.print(f"{len(names)} joints are not part of the arm, since each {why}: {', '.join(names)}")
     for note in draft.notes:
         console.print(note, style="yellow")
     if draft.servo is not None:

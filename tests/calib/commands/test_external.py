@@ -99,6 +99,14 @@ def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):
     assert "quiet.csv: cannot be read" in capsys.readouterr().err
 
 
+def test_a_model_file_alone_is_not_called_records(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    assert run(["external", "arm.xml", "quiet.csv", "--out", "alone.csv"]) == 0
+    said = capsys.readouterr()
+    assert "follow from the model alone" in said.err
+    assert "alone.csv is written" in said.out
+
+
 def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     monkeypatch.chdir(workplace)
     joints = [
@@ -120,7 +128,7 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
     out = capsys.readouterr()
     answer = json.loads(out.out)
     assert answer["baseline_s"] == 0.0
-    assert "from the records alone" in out.err
+    assert "follow from the records alone" in out.err
     assert Path("felt.svg").read_text().startswith("<svg")
 
 

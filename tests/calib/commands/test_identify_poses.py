@@ -21,7 +21,7 @@ from gcomp.arm.load import inertial_torque
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
-TWO = """<mujoco><worldbody><body pos="0 0 0.3"><joint name="a" axis="0 1 0" range="-2 2"/>
+TWO = """<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 0.3"><joint name="a" axis="0 1 0" range="-2 2"/>
 <geom size="0.05" pos="0.2 0 0" mass="{}"/><body pos="0.4 0 0"><joint name="b" axis="0 1 0" range="-2 2"/>
 <geom size="0.04" pos="0.15 0 0.02" mass="1"/></body></body></worldbody></mujoco>"""
 
@@ -131,6 +131,14 @@ def test_held_out_poses_that_the_model_itself_predicts_better_end_with_status_1(
     table(tmp_path / "other.csv", q, gravity_torque(nominal.arm, nominal.beta, q))
     given = ["poses.csv", "--model", "arm.xml", "--gain-std", "0", "--heldout", str(tmp_path / "other.csv")]
     assert answered(bench, *given, status=1)["held_out"]["passed"] is False
+
+
+def test_poses_beyond_the_limits_of_a_model_in_degrees_are_doubted(bench, tmp_path, capsys):
+    answered(bench, "poses.csv", "--model", "arm.xml")
+    assert "doubtful" not in capsys.readouterr().out
+    (tmp_path / "arm.xml").write_text(TWO.format(2).replace('angle="radian"', ""))
+    answered(bench, "poses.csv", "--model", str(tmp_path / "arm.xml"))
+    assert "doubtful: the poses of a, b go further than the limits" in capsys.readouterr().out
 
 
 def test_an_arm_file_gets_a_gravity_record(bench, tmp_path):

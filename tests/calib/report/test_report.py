@@ -23,6 +23,7 @@ from calib.records.records import CalibrationRecord, JointCalibration
 from calib.records.store import RecordStore
 from calib.report.calibration import Calibrated, write_report
 from calib.report.figures import sweep_rows, sweeps_of
+from calib.report.tables import interval_text
 
 ARM = random_arm(1, 3)
 TRUTH, DATA = passes(ARM, 1)
@@ -76,6 +77,13 @@ def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complain
         each for each in differences(before, record) if (each.joint, each.parameter) == (ARM.joint_names[1], "gain")
     )
     assert f"{change.change:+.5f}" in document
+
+
+def test_an_interval_is_shown_with_as_many_places_as_it_needs() -> None:
+    assert interval_text(0.9081, 0.0009) == "0.9081\u00a0±\u00a00.0009"
+    assert interval_text(0.00441, 0.000021) == "0.00441\u00a0±\u00a00.00002"
+    assert interval_text(0.5, 0.0) == "0.5000"
+    assert interval_text(np.nan, 1.0) == "not observable"
 
 
 def test_a_first_report_compares_with_what_the_controllers_had(fit, record, tmp_path) -> None:

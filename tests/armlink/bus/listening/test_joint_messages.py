@@ -199,6 +199,12 @@ def test_a_slow_drift_of_the_sender_s_clock_is_followed():
     assert abs(times[-1] - (0.01 * 99_999 + 0.002)) < 1e-3
 
 
+def test_messages_that_waited_when_listening_began_keep_their_times():
+    waited = [message(k)._replace(arrived=9.9915) for k in range(-20, 0)]
+    samples, _ = samples_of([*waited, *map(message, range(20))])
+    assert np.diff([sample.t for sample in samples]) == pytest.approx(np.full(38, 0.01), abs=1e-3)
+
+
 def test_why_nothing_is_heard():
     described = arm()
     assert bus_of([]).silence() == "no message has come: is anything there?"
