@@ -10,6 +10,7 @@ from calib.commands.options import JsonFile, Store, Tool
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
+    from armlink.recording.recording import Recording
     from calib.external.arm_model import ArmRecords
     from calib.external.listening import Heard, WrenchFrame
 
@@ -72,13 +73,19 @@ def external(
     from calib.external.learned import Learned, load_learned, save_learned
     from calib.external.listening import listen
     from calib.external.tables import answer_of, save_heard
+    from calib.fit.pose_readings import in_joint_order
 
     if not recordings and picture is None and not (learned and baseline):
         raise BadInput("give recordings to judge, or --picture FILE.svg for the smallest force that is felt")
     per_hour = parse_rate(false_alarms)
     records = _records(arm, base, tip, tool, store)
-    judged = {label: each for path in recordings or [] for label, each in load_recordings(path, stated).items()}
-    free = [each for path in baseline or [] for each in load_recordings(path, stated).values()]
+    names = records.stated.arm.names
+
+    def loaded(paths: list[str] | None) -> "dict[str, Recording]":
+        every = {label: each for path in paths or [] for label, each in load_recordings(path, stated).items()}
+        return {label: in_joint_order(each, names, label) for label, each in every.items()}
+
+    judged, free = loaded(recordings), list(loaded(baseline).values())
     place = parse_frame(frame, records)
     if learned is not None and not free:
         listener = load_learned(learned, records).listener
@@ -96,7 +103,6 @@ def external(
             "the arm: give recordings without contact as --baseline",
             style="yellow",
         )
-    names = records.stated.arm.names
     for label, recording in judged.items():
         heard = list(listen(listener, recording, place, per_hour))
         every += heard

@@ -57,7 +57,7 @@ def observe(
     gravity = records.required(GravityRecord, arm_file).carrying(arm_file)
     described = gcomp_arm(arm_file)
     observer = observer_of(described, calibration, gravity, arm_file.require_link().rated_torques)
-    samples = _recorded(arm_file, recording) if recording is not None else _heard(arm_file, source, seconds)
+    samples = recorded(arm_file, recording) if recording is not None else _heard(arm_file, source, seconds)
     console, told = PlainConsole(), list[dict[str, Any]]()
     rows, first, last = 0, 0.0, 0.0
     for t, position, torque in samples:
@@ -88,16 +88,16 @@ def observe(
     return int(bool(changes))
 
 
-def _recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]]":
+def recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]]":
+    """Rows of a recording: time [s], positions and torques, in the order of the arm's joints. Raises BadInput."""
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording
+    from calib.fit.pose_readings import in_joint_order
 
-    run = load_recording(path)
-    names = arm.joint_names or tuple(joint.name for joint in arm.require_link().joints)
+    run = in_joint_order(load_recording(path), arm.joint_names, str(path))
     torque = run.torque if run.torque is not None else run.motor_torque
-    if run.n != len(names) or torque is None:
-        lacks = "no torques" if torque is None else f"{run.n} joints"
-        raise BadInput(f"{path}: it has {lacks}, expected torques of {len(names)} joints ({', '.join(names)})")
+    if torque is None:
+        raise BadInput(f"{path}: it has no torques, expected those of {', '.join(arm.joint_names)}")
     yield from ((float(t), q, tau) for t, q, tau in zip(run.t, run.position, torque, strict=True))
 
 

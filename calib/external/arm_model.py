@@ -89,12 +89,9 @@ def channel_of(recordings: Sequence[Recording]) -> str:
 def listener_of(
     records: ArmRecords, baselines: Sequence[Recording], recordings: Sequence[Recording], channel: str | None = None
 ) -> ArmListener:
-    """Learned from `baselines`; without any, by the records alone. Raises BadInput where joints do not fit."""
+    """Learned from `baselines`; without any, by the records alone. Recordings have the arm's joints in its order."""
     arm = records.stated.arm
     every = [*baselines, *recordings]
-    for each in every:
-        if each.n != arm.n:
-            raise BadInput(f"a recording has {each.n} joints ({', '.join(each.names)}), but the arm has {arm.n}")
     channel = channel or (channel_of(every) if every else records.usual_channel)
     rate = rate_of(every) if every else ROWS_RATE
     warm = _usual_temperature(baselines or recordings)

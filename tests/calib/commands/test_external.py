@@ -84,6 +84,17 @@ def test_a_push_is_found_and_free_motion_is_quiet(workplace, capsys):
     assert told == pytest.approx(8.0, abs=1.5)
 
 
+def test_joints_of_a_recording_are_found_by_their_names(workplace, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    plain = recording(Path("arm.xml"), 3, 8.0)
+    channels = {name: getattr(plain, name)[:, ::-1] for name in ("position", "velocity", "motor_torque")}
+    save_recording(Recording(t=plain.t, names=("j3", "j2", "j1"), **channels), tmp_path / "turned.mcap")
+    words = ["external", "arm.xml", "pushed.csv", str(tmp_path / "turned.mcap"), "--baseline", "free_1.csv"]
+    assert run([*words, "--json", "-"]) == 0
+    one, other = json.loads(capsys.readouterr().out)["recordings"]
+    assert other["rms"] == pytest.approx(one["rms"], rel=1e-3)
+
+
 def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):
     monkeypatch.chdir(workplace)
     assert (

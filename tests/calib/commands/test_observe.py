@@ -11,10 +11,12 @@ import pytest
 from fast_daemon import FastDaemon
 
 from armlink import cli
+from armlink.arm_file import load_arm
 from armlink.bus import open as bus_open
 from armlink.bus.listening.joint_messages import JointStateMessage, ListeningBus
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
+from calib.commands.observe import recorded
 
 SECONDS, BEFORE = 300.0, 60.0
 
@@ -99,3 +101,13 @@ def test_a_sound_arm_and_two_sources(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert observed([str(tmp_path / "run.csv"), *store], capsys)[0] == 0
     assert cli.run(["observe", "sarcos", str(tmp_path / "run.csv"), "--ros2", "/joint_states", *store]) == 2
     assert cli.run(["observe", "sarcos", "--bus", "virtual:x", "--ros2", "/joint_states", *store]) == 2
+
+
+def test_joints_of_a_recording_are_found_by_their_names(tmp_path: Path) -> None:
+    arm = load_arm("sarcos")
+    t, values = np.arange(0.0, 1.0, 0.1), np.arange(70.0).reshape(10, 7)
+    turned = Recording(t=t, position=values, torque=values + 0.5, names=arm.joint_names[::-1])
+    save_recording(turned, tmp_path / "run.mcap")
+    rows = list(recorded(arm, tmp_path / "run.mcap"))
+    assert np.array([q for _, q, _ in rows]) == pytest.approx(values[:, ::-1])
+    assert np.array([torque for _, _, torque in rows]) == pytest.approx(values[:, ::-1] + 0.5)
