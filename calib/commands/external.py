@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import reads_recordings
-from calib.commands.options import JsonFile, Store, Tool
+from calib.commands.options import ArmOrModel, ChainBase, ChainTip, JsonFile, Store, Tool
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @reads_recordings
 def external(
-    arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
+    arm: ArmOrModel,
     stated: "Corrections",
     recordings: Annotated[list[str] | None, typer.Argument(help="Recordings to judge.")] = None,
     baseline: Annotated[
@@ -46,12 +46,8 @@ def external(
     picture: Annotated[
         Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
     ] = None,
-    base: Annotated[
-        str | None, typer.Option(help="Body of the model file that carries the chain; by default the world.")
-    ] = None,
-    tip: Annotated[
-        str | None, typer.Option(help="Last body of the chain in the model file; by default the last body that moves.")
-    ] = None,
+    base: ChainBase = None,
+    tip: ChainTip = None,
     tool: Tool = None,
     store: Store = None,
     json_file: JsonFile = None,
@@ -69,14 +65,19 @@ def external(
     from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
     from calib.external.arm_model import listener_of
+    from calib.external.even_samples import SHORTEST
     from calib.external.force_map import draw_map, smallest_forces
     from calib.external.learned import Learned, load_learned, save_learned
     from calib.external.listening import listen
-    from calib.external.tables import answer_of, save_heard
+    from calib.external.tables import answer_of, require_writable, save_heard
     from calib.fit.pose_readings import in_joint_order
 
     if not recordings and picture is None and not (learned and baseline):
         raise BadInput("give recordings to judge, or --picture FILE.svg for the smallest force that is felt")
+    if out is not None:
+        require_writable(out)
+        if not recordings:
+            raise BadInput(f"--out {out}: give recordings to judge")
     per_hour = parse_rate(false_alarms)
     records = _records(arm, base, tip, tool, store)
     names = records.stated.arm.names
@@ -92,6 +93,8 @@ def external(
     else:
         with PlainConsole().status("learning what the arm does without contact"):
             listener = listener_of(records, free, list(judged.values()))
+        if free and not listener.model.seconds:
+            raise BadInput(f"--baseline: no recording has {SHORTEST:g} s without a gap: record for longer")
         if learned is not None:
             save_learned(learned, Learned(listener, place, per_hour))
     console, answers = results(json_file), []
@@ -105,6 +108,8 @@ def external(
         )
     for label, recording in judged.items():
         heard = list(listen(listener, recording, place, per_hour))
+        if not heard:
+            raise BadInput(f"{label}: it has no {SHORTEST:g} s without a gap, which judging needs: record for longer")
         every += heard
         answers.append(answer_of(label, heard, names))
         _tell(console, answers[-1], names)
@@ -195,11 +200,10 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
     for name, rms, bound, rest in zip(names, answer["rms"], answer["bound"], answer["bound_at_rest"], strict=True):
         table.add_row(name, *("–" if x is None else f"{x:.3f}" for x in (rms, bound, rest)))
     console.print(table)
-    best, worst = answer["smallest_force"]
-    far = "not determined" if worst is None else f"{worst:.1f} N"
+    best, worst = ("not determined" if force is None else f"{force:.1f} N" for force in answer["smallest_force"])
     console.print(
-        f"{answer['seconds']:.1f} s judged. Smallest force at the frame that is found in 95 %: {best:.1f} N along the "
-        f"best direction, {far} along the worst"
+        f"{answer['seconds']:.1f} s judged. Smallest force at the frame that is found in 95 %: {best} along the best "
+        f"direction, {worst} along the worst"
     )
     for event in answer["events"]:
         where = f"{event['t']:9.2f} s  {event['kind']}"

@@ -12,6 +12,15 @@ if TYPE_CHECKING:
     from calib.records.store import RecordStore
     from gcomp.arrays import Array
 
+ArmOrModel = Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")]
+ChainBase = Annotated[
+    str | None,
+    typer.Option("--base", help="Body of the model file that carries the chain; by default the world."),
+]
+ChainTip = Annotated[
+    str | None,
+    typer.Option("--tip", help="Last body of the chain in the model file; by default the last body that moves."),
+]
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, with and without a reference mass.")]
 SweepsArm = Annotated[
     str | None, typer.Option("--arm", help="Arm file, if it is no longer where it was during the sweep.")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.commands.options import JsonFile, Store, Tool
+from calib.commands.options import ArmOrModel, ChainBase, ChainTip, JsonFile, Store, Tool
 
 if TYPE_CHECKING:
     from gcomp.arm.arm import Arm
@@ -13,14 +13,10 @@ if TYPE_CHECKING:
 
 
 def torque(
-    arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
+    arm: ArmOrModel,
     q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
-    base: Annotated[
-        str | None, typer.Option(help="Body of the model file that carries the chain; by default the world.")
-    ] = None,
-    tip: Annotated[
-        str | None, typer.Option(help="Last body of the chain in the model file; by default the last body that moves.")
-    ] = None,
+    base: ChainBase = None,
+    tip: ChainTip = None,
     record: Annotated[
         str | None,
         typer.Option(help="Id of a gravity record; by default the inertials of the model, or else the current record."),

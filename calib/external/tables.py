@@ -1,6 +1,6 @@
 """External torque and wrench over time as tables and answers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +15,29 @@ from gcomp.external.contact import ContactEvent
 from gcomp.external.external_model import NORMAL_95
 
 AXES = ("x", "y", "z")
+SUFFIXES = (".csv", ".mcap")
+REST_SPEED = 0.01
+"""Speed of the fastest joint below which the arm rests [rad/s]."""
 NOT_FELT = 1e5
 """Force that no arm of ours would feel [N]: a direction of which it is needed is not determined."""
 
 
 def answer_of(label: str, heard: Sequence[Heard], names: tuple[str, ...]) -> dict[str, Any]:
-    """A recording's part of the answer `armlink.external/1`."""
-    n = len(names)
-    external = np.concatenate([each.judged.external for each in heard]) if heard else np.empty((0, n))
-    std = np.concatenate([each.judged.std for each in heard]) if heard else np.empty((0, n))
-    moved = [np.abs(np.gradient(each.position, each.t, axis=0)).max(axis=1) for each in heard if len(each.t) > 1]
-    rest = np.concatenate(moved) < 0.01 if moved else np.empty(0, bool)
-    best = np.concatenate([each.least_force[0] for each in heard]) if heard else np.empty(0)
-    worst = np.concatenate([each.least_force[1] for each in heard]) if heard else np.empty(0)
+    """A recording's part of the answer `armlink.external/1`, of at least one stretch."""
+    external, std, best, worst = (
+        np.concatenate(column)
+        for column in zip(*((each.judged.external, each.judged.std, *each.least_force) for each in heard), strict=True)
+    )
+    moved = np.concatenate([np.abs(np.gradient(each.position, each.t, axis=0)).max(axis=1) for each in heard])
+    rest = moved < REST_SPEED
     return {
         "recording": label,
         "seconds": float(sum(each.t[-1] - each.t[0] for each in heard)),
-        "rms": _listed(np.sqrt(np.mean(external**2, axis=0))) if len(external) else [None] * n,
-        "bound": _listed(NORMAL_95 * np.median(std, axis=0)) if len(std) else [None] * n,
-        "bound_at_rest": _listed(NORMAL_95 * np.median(std[rest], axis=0)) if rest.any() else [None] * n,
+        "rms": _listed(np.sqrt(np.mean(external**2, axis=0))),
+        "bound": _listed(NORMAL_95 * np.median(std, axis=0)),
+        "bound_at_rest": _listed(NORMAL_95 * np.median(std[rest], axis=0)) if rest.any() else [None] * len(names),
         "smallest_force": [_felt(best), _felt(worst)],
-        "load": _listed(heard[-1].load) if heard else [0.0] * 4,
+        "load": _listed(heard[-1].load),
         "events": [event_of(event, names) for each in heard for event in each.events],
     }
 
@@ -71,27 +73,27 @@ def columns_of(heard: Heard) -> dict[str, Array]:
     return columns
 
 
+def require_writable(path: Path) -> None:
+    """Raise BadInput for a suffix that `save_heard` does not write, or if what it needs is not installed."""
+    if path.suffix not in SUFFIXES:
+        raise BadInput(f"--out {path}: this suffix is not one of {', '.join(SUFFIXES)}")
+    if path.suffix == ".mcap":
+        require_extra("--out", "bags")
+
+
 def save_heard(path: Path, heard: Sequence[Heard], names: tuple[str, ...], frame_id: str) -> None:
-    """Write by suffix; `frame_id` names the frame whose axes a wrench is in. Raises BadInput."""
+    """Write by suffix; `frame_id` names the frame whose axes a wrench is in."""
     if path.suffix == ".csv":
         parts = [columns_of(each) for each in heard]
         table = np.column_stack([np.concatenate([part[name] for part in parts]) for name in parts[0]])
         lines = [",".join("" if np.isnan(x) else f"{x:.9g}" for x in row) for row in table]
         write_whole(path, "\n".join([",".join(parts[0]), *lines]) + "\n")
         return
-    if path.suffix == ".mcap":
-        require_extra("--out", "bags")
-        from armlink.recording.wrench_bag import save_wrench_bag
+    from armlink.recording.wrench_bag import save_wrench_bag
 
-        def joined(of: Callable[[Heard], Array]) -> Array:
-            return np.concatenate([of(each) for each in heard])
-
-        save_wrench_bag(
-            path, joined(lambda each: each.t), names, joined(lambda each: each.judged.external),
-            joined(lambda each: each.judged.std), frame_id, joined(lambda each: each.wrench.value),
-        )  # fmt: skip
-        return
-    raise BadInput(f"{path}: this suffix is not one of .csv, .mcap")
+    columns = ((each.t, each.judged.external, each.judged.std, each.wrench.value) for each in heard)
+    t, external, std, value = (np.concatenate(column) for column in zip(*columns, strict=True))
+    save_wrench_bag(path, t, names, external, std, frame_id, value)
 
 
 def _listed(values: Array) -> list[float]:
@@ -100,5 +102,5 @@ def _listed(values: Array) -> list[float]:
 
 def _felt(values: Array) -> float | None:
     """Median of a smallest force [N]; None where the direction is not determined."""
-    middle = float(np.median(values)) if len(values) else np.inf
+    middle = float(np.median(values))
     return middle if middle < NOT_FELT else None

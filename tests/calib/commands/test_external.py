@@ -60,6 +60,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("pushed", 3, 8.0),
     ):
         save_recording(recording(folder / "arm.xml", seed, push), folder / f"{name}.csv")
+    rows = (folder / "quiet.csv").read_text().splitlines(keepends=True)
+    (folder / "short.csv").write_text("".join(rows[:40]))
     return folder
 
 
@@ -151,6 +153,9 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
         ("arm.xml quiet.csv --frame j9", "one of the joints j1, j2, j3"),
         ("arm.xml quiet.csv --frame j2,1", "JOINT,X,Y,Z"),
         ("arm.xml quiet.csv --out out.txt", "out.txt"),
+        ("arm.xml --picture felt.svg --baseline free_1.csv --out out.csv", "give recordings to judge"),
+        ("arm.xml short.csv --baseline free_1.csv", "short.csv: it has no 1 s without a gap"),
+        ("arm.xml quiet.csv --baseline short.csv", "--baseline: no recording has 1 s without a gap"),
         ("none.xml quiet.csv", "none.xml"),
     ],
 )
