@@ -1,12 +1,18 @@
 """Array types, and the checks that public functions make of their arguments."""
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gcomp.errors import BadArray
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -39,6 +45,14 @@ def as_batch(array: Array, leading: tuple[int, ...]) -> Array:
     """An array (K, …) in the leading shape of the poses."""
     batch: Array = array.reshape(*leading, *array.shape[1:])
     return batch
+
+
+def joined(parts: Sequence[T]) -> T:
+    """One dataclass of arrays from the rows of several, one after the other; dataclasses in it likewise."""
+    kind = type(parts[0])
+    columns = ([getattr(part, each.name) for part in parts] for each in fields(kind))
+    whole = (joined(column) if is_dataclass(column[0]) else np.concatenate(column) for column in columns)
+    return kind(*whole)
 
 
 def frozen(instance: Any, **fields: Any) -> None:

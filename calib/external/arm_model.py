@@ -16,7 +16,7 @@ from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
 from gcomp.external.external_model import ROWS_RATE, ArmPrior, ExternalModel, from_records, learn
 from gcomp.external.filtered_rows import Samples
-from gcomp.external.rigid_motion import INERTIAL
+from gcomp.external.rigid_motion import LINK_PARAMETERS
 
 LARGEST_SHARE = 99
 """Percentile of its torques that is a joint's scale, where no rating is known."""
@@ -43,7 +43,7 @@ class ArmRecords:
         beta = np.array(self.gravity.beta).reshape(arm.n, 2)
         reach = max(float(np.linalg.norm(arm.span, axis=1).sum()), 0.1)
         mass = float(np.abs(beta).max()) / reach / arm.n
-        links = np.zeros((arm.n, INERTIAL))
+        links = np.zeros((arm.n, LINK_PARAMETERS))
         links[:, 0] = mass
         links[:, [4, 7, 9]] = (mass * (np.linalg.norm(arm.span, axis=1) ** 2 + 0.01) / 3.0)[:, None]
         return links

@@ -6,9 +6,9 @@ import numpy as np
 
 from armlink.content.atomic_file import write_whole
 from calib.external.listening import WrenchFrame
-from gcomp.arrays import Array
+from gcomp.arrays import Array, joined
 from gcomp.external.contact import ContactDetector
-from gcomp.external.external_model import ExternalModel, joined
+from gcomp.external.external_model import ExternalModel
 from gcomp.external.filtered_rows import Samples
 from gcomp.external.wrench import force_found
 

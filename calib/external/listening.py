@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from calib.external.arm_model import ArmListener
-from gcomp.arrays import Array
+from gcomp.arrays import Array, joined
 from gcomp.external.contact import ContactDetector, ContactEvent, JudgedRows
 from gcomp.external.external_model import CHUNK
 from gcomp.external.wrench import Wrench, smallest_force, wrench
@@ -44,40 +44,26 @@ def listen(listener: ArmListener, recording: Recording, frame: WrenchFrame, per_
     model = listener.model
     for t, samples in listener.samples(recording):
         made, detector = model.filter(listener.rate), ContactDetector(model, per_hour, frame.point)
-        parts = []
+        parts, events = [], list[ContactEvent]()
         for begin in range(0, len(samples), CHUNK):
             part = slice(begin, begin + CHUNK)
             filtered = made.rows(samples.part(part))
             rows, when = model.rows(filtered), t[part][filtered.chosen]
-            judged, events = detector.judge(when, rows)
+            judged, found = detector.judge(when, rows)
+            events += found
             motion, spread = filtered.motion, model.lasting
             told = wrench(motion, frame.link, frame.point, judged.external, judged.std, spread.precision)
             least = smallest_force(
                 model, detector.sudden_limit, motion, frame.link, frame.point, judged.change_std, model.sudden
             )
-            parts.append((when, samples.position[part][filtered.chosen], judged, told, least, events))
+            parts.append((when, samples.position[part][filtered.chosen], judged, told, *least))
+        times, positions, judgements, wrenches, best, worst = zip(*parts, strict=True)
         yield Heard(
-            _joined([each[0] for each in parts]),
-            _joined([each[1] for each in parts]),
-            JudgedRows(
-                *(_joined([getattr(each[2], name) for each in parts]) for name in JudgedRows.__dataclass_fields__)
-            ),
-            _joined_wrench([each[3] for each in parts]),
-            (_joined([each[4][0] for each in parts]), _joined([each[4][1] for each in parts])),
-            [event for each in parts for event in each[5]],
+            np.concatenate(times),
+            np.concatenate(positions),
+            joined(judgements),
+            joined(wrenches),
+            (np.concatenate(best), np.concatenate(worst)),
+            events,
             detector.load,
         )
-
-
-def _joined_wrench(parts: list[Wrench]) -> Wrench:
-    return Wrench(
-        _joined([each.value for each in parts]),
-        _joined([each.covariance for each in parts]),
-        np.concatenate([each.determined for each in parts]),
-        _joined([each.force for each in parts]),
-        _joined([each.force_std for each in parts]),
-    )
-
-
-def _joined(parts: list[Array]) -> Array:
-    return np.concatenate(parts)

@@ -1,6 +1,6 @@
 """The belief about an arm before its own work is seen: its records, its model, and what sound arms lack."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.external.external_model import ArmPrior
 from gcomp.external.filtered_rows import JOINT_COLUMNS, WAVES
-from gcomp.external.rigid_motion import INERTIAL, gravity_split
+from gcomp.external.rigid_motion import LINK_PARAMETERS, gravity_split
 from gcomp.identify.motor_model import MotorDoubt
 
 LEAST_MASS = 0.02
@@ -74,7 +74,7 @@ def prior_of_model(arm: Arm, links: Array, doubt: JointDoubt, scale: Array) -> A
     n = arm.n
     mass = np.maximum(links[:, 0], LEAST_MASS * links[:, 0].sum())
     reach = np.maximum(np.linalg.norm(arm.span, axis=1), LEAST_REACH)
-    std = np.empty((n, INERTIAL))
+    std = np.empty((n, LINK_PARAMETERS))
     std[:, 0] = MASS_DOUBT * mass
     std[:, 1:4] = (PLACE_DOUBT * mass * reach)[:, None]
     std[:, 4:] = (PLACE_DOUBT * mass * reach**2)[:, None]
@@ -90,7 +90,7 @@ def with_gravity(prior: ArmPrior, arm: Arm, gravity: GravityRecord, beta: Array)
     links[:, 1:3] += (np.array(gravity.beta) - beta).reshape(n, 2)
     covariance[: 2 * n] = covariance[:, : 2 * n] = 0.0
     covariance[: 2 * n, : 2 * n] = np.array(gravity.covariance)
-    return ArmPrior(links, covariance, prior.joints, prior.joints_std, prior.noise)
+    return replace(prior, links=links, covariance=covariance)
 
 
 def with_calibration(prior: ArmPrior, calibration: CalibrationRecord) -> ArmPrior:
@@ -112,4 +112,4 @@ def with_calibration(prior: ArmPrior, calibration: CalibrationRecord) -> ArmPrio
         if joint.motor is not None:
             for name in ("coulomb", "load", "viscous"):
                 mean[j, at[name]], std[j, at[name]] = getattr(joint.motor, name)
-    return ArmPrior(prior.links, prior.covariance, mean, std, noise)
+    return replace(prior, joints=mean, joints_std=std, noise=noise)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.inertials import body_parameters, inertial_of_pseudo, pseudo_inertia, set_body
-from gcomp.arm.load import PlacedChain
+from gcomp.arm.load import PlacedChain, body_in_bar_frame
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
 
@@ -32,7 +32,7 @@ def with_moments(placed: PlacedChain, beta: Array) -> Any:
     """
     arm, model = placed.arm.arm, copy.copy(placed.model)
     heaviest = [max(bodies, key=lambda body: float(model.body_mass[body])) for bodies in placed.bodies]
-    frames = [_body_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)]
+    frames = [body_in_bar_frame(placed, link, body) for link, body in enumerate(heaviest)]
     own = np.array(
         [body_parameters(model, body, -turn.T @ at, turn) for body, (turn, at) in zip(heaviest, frames, strict=True)]
     )
@@ -116,9 +116,3 @@ def _spread(arm: Arm, nominal: Array, beta: Array) -> Array:
         if np.linalg.eigvalsh(each / np.outer(root, root)).min() < SMALLEST_SHARE:
             spread[link] += least
     return spread
-
-
-def _body_in_bar_frame(placed: PlacedChain, link: int, body: int) -> tuple[Array, Array]:
-    """(Rotation, origin) of a body's frame in its link's bar frame."""
-    bar, data = placed.geometry.bar[link], placed.data
-    return bar.T @ data.xmat[body].reshape(3, 3), bar.T @ (data.xpos[body] - placed.geometry.origins[link])

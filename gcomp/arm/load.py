@@ -287,14 +287,19 @@ def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
     return link_of
 
 
+def body_in_bar_frame(placed: PlacedChain, link: int, body: int) -> tuple[Array, Array]:
+    """(Rotation, origin) of a body's frame in its link's bar frame."""
+    bar, data = placed.geometry.bar[link], placed.data
+    return bar.T @ data.xmat[body].reshape(3, 3), bar.T @ (data.xpos[body] - placed.geometry.origins[link])
+
+
 def bar_inertials(placed: PlacedChain) -> Array:
     """Ten inertial parameters of each link about its bar frame's origin, in the bar frame (n, 10)."""
-    geometry, found = placed.geometry, np.zeros((placed.arm.arm.n, 10))
+    found = np.zeros((placed.arm.arm.n, 10))
     for link, bodies in enumerate(placed.bodies):
         for body in bodies:
-            turn = placed.data.xmat[body].reshape(3, 3)
-            origin = turn.T @ (geometry.origins[link] - placed.data.xpos[body])
-            found[link] += body_parameters(placed.model, body, origin, geometry.bar[link].T @ turn)
+            turn, at = body_in_bar_frame(placed, link, body)
+            found[link] += body_parameters(placed.model, body, -turn.T @ at, turn)
     return found
 
 

@@ -28,18 +28,21 @@ def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array
     return beta.ravel()
 
 
-def payload_columns(arm: Arm) -> tuple[Array, Array]:
-    """(E_0 (2n,), E_ρ (2n, 3)): mass μ at point ρ of bar frame n adds Δβ = μ (E_0 + E_ρ ρ); equation (P)."""
-    none = np.zeros((arm.n, 3))
-    mass = np.zeros(arm.n)
-    mass[-1] = 1.0
-    at_origin = base_parameters(arm, mass, none)
+def link_columns(arm: Arm, link: int) -> tuple[Array, Array]:
+    """(E_0 (2n,), E_ρ (2n, 3)): mass μ at point ρ of a link's bar frame adds Δβ = μ (E_0 + E_ρ ρ); equation (P)."""
+    mass, none = np.zeros(arm.n), np.zeros((arm.n, 3))
+    mass[link] = 1.0
     by_point = np.empty((2 * arm.n, 3))
     for axis in range(3):
         moment = none.copy()
-        moment[-1, axis] = 1.0
+        moment[link, axis] = 1.0
         by_point[:, axis] = base_parameters(arm, np.zeros(arm.n), moment)
-    return at_origin, by_point
+    return base_parameters(arm, mass, none), by_point
+
+
+def payload_columns(arm: Arm) -> tuple[Array, Array]:
+    """The same of the last link, which carries payloads."""
+    return link_columns(arm, arm.n - 1)
 
 
 def base_parameter_names(arm: Arm) -> tuple[str, ...]:

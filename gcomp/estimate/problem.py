@@ -11,7 +11,7 @@ from gcomp.arrays import Array
 Index = NDArray[np.intp]
 FREEDOM = 4.0
 """Degrees of freedom of Student's t (Lange, Little and Taylor, JASA 84, 1989)."""
-AS_GOOD = 0.3
+CHEAPER_ERROR = 0.3
 """Relative difference of a derivative by the cheaper prediction up to which it serves: it leads to the same point, and
 a step that is off by a third brings nine tenths of its fall."""
 NORMAL = 1e6
@@ -73,7 +73,9 @@ class EstimationProblem:
         left = (self.weight * (residual**2 + self.floor[:, None] ** 2)).sum(1, keepdims=True)
         share = self.weight / np.maximum(left, 1e-300)
         apart, size = (float((share * x**2).sum()) for x in (tried - there - exact[0], exact[0]))
-        others = self.cheaper(moved[1:]) - there if apart <= AS_GOOD**2 * size else self.predict(moved[1:]) - residual
+        others = (
+            self.cheaper(moved[1:]) - there if apart <= CHEAPER_ERROR**2 * size else self.predict(moved[1:]) - residual
+        )
         return np.concatenate([exact, others])
 
 

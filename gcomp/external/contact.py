@@ -6,7 +6,7 @@ hypothesis that explains the change best: a force at a point of some link, or a 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,12 +17,12 @@ from gcomp.external.external_model import (
     BLOCK,
     DRIFT,
     ROWS_RATE,
-    SLOW,
     ExternalModel,
     TorqueRows,
     model_variance,
+    slow_weight,
 )
-from gcomp.external.rigid_motion import INERTIAL, RigidMotion, jacobian
+from gcomp.external.rigid_motion import LINK_PARAMETERS, RigidMotion, jacobian
 
 FEWEST_MAXIMA = 5
 """Stretches from which a threshold is taken; with fewer, deviations count as normally distributed."""
@@ -125,7 +125,7 @@ class ContactDetector:
         self.lasting_limit, self.sudden_limit = (threshold(each, per_hour / 2.0, n) for each in model.maxima)
         self._lasting_inverse, self._sudden_inverse = model.lasting.precision, model.sudden.precision
         back = np.linalg.inv(model.split)
-        self._load_columns = back[:, INERTIAL * (n - 1) : INERTIAL * (n - 1) + 4]
+        self._load_columns = back[:, LINK_PARAMETERS * (n - 1) : LINK_PARAMETERS * (n - 1) + 4]
         self.load = np.zeros(4)
         """Mass [kg] and first moment [kg·m] of what the arm has taken up since."""
         self._slow: Array | None = None
@@ -161,18 +161,13 @@ class ContactDetector:
 
     def _away(self, columns: Array) -> Array:
         """Columns (S, n, Q) less what they were before."""
-        away, share = np.empty_like(columns), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
+        away = np.empty_like(columns)
         for row, each in enumerate(columns):
             if self._slow_columns is None or self._seen + row < BEGINNING_ROWS:
                 self._slow_columns = each.copy()
             np.subtract(each, self._slow_columns, out=away[row])
-            count = self._seen + row - BEGINNING_ROWS + 1
-            self._slow_columns += max(share, 1.0 / max(count, 1)) * away[row]
+            self._slow_columns += slow_weight(self._seen + row - BEGINNING_ROWS + 1) * away[row]
         return away
-
-    def _share(self) -> float:
-        """Weight of a row in the mean of what was before."""
-        return max(float(1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))), 1.0 / max(self._seen - BEGINNING_ROWS, 1))
 
     def _row(
         self, t: float, external: Array, std: Array, change_std: Array, deviation: float, loaded: Array,
@@ -191,7 +186,7 @@ class ContactDetector:
                 by_change = begun and sudden / self.sudden_limit >= deviation / self.lasting_limit
                 self._open = _OpenEvent(t, self._slow.copy() if by_change else 0.0 * external, by_change)
             else:
-                self._slow = self._slow + self._share() * (external - self._slow)
+                self._slow = self._slow + slow_weight(self._seen - BEGINNING_ROWS) * (external - self._slow)
                 self._drift = self._drift + external / (DRIFT * ROWS_RATE)
         opened = self._open
         if opened is not None:
@@ -280,13 +275,11 @@ class _OpenEvent:
     before: Array
     """External torque before it (n,)."""
     by_change: bool
-    rows: list[tuple[Array, Array, Array]] = None  # type: ignore[assignment]
+    rows: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    """Change, its standard deviation, and a load's columns, of the newest ones."""
     count: int = 0
     quiet: int = 0
     event: ContactEvent | None = None
-
-    def __post_init__(self) -> None:
-        self.rows = []
 
 
 def contact_likelihood(

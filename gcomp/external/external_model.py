@@ -7,16 +7,16 @@ not known), whose sizes are those of maximum likelihood.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arm.arm import Arm
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array, Mask, joined
 from gcomp.external.filtered_rows import JOINT_COLUMNS, FilteredRows, RowFilter, Samples
-from gcomp.external.rigid_motion import INERTIAL, RigidMotion, gravity_split
+from gcomp.external.rigid_motion import LINK_PARAMETERS, RigidMotion, gravity_split
 
 NORMAL_95 = 1.959964
 ROWS_RATE = 25.0
@@ -29,6 +29,7 @@ BEGINNING = 0.6
 """Left out at the begin of a recording [s]: friction of an arm in motion has found its direction then."""
 SLOW = 1.5
 """Time constant of what a change is compared with [s]."""
+SLOW_SHARE = float(1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE)))
 DRIFT = 120.0
 """Time constant with which what is left over for good is taken for a drift of the arm's own, as of sensors that warm
 up [s]: of a push that lasts ten seconds a twelfth."""
@@ -74,12 +75,12 @@ class TorqueRows:
     @property
     def by_link(self) -> Array:
         """(S, n, 10 n)."""
-        return self.columns[..., : INERTIAL * self.left.shape[1]]
+        return self.columns[..., : LINK_PARAMETERS * self.left.shape[1]]
 
     @property
     def by_joint(self) -> Array:
         """(S, n, C)."""
-        return self.columns[..., INERTIAL * self.left.shape[1] :]
+        return self.columns[..., LINK_PARAMETERS * self.left.shape[1] :]
 
     def part(self, rows: slice | Mask) -> "TorqueRows":
         return TorqueRows(self.left[rows], self.columns[rows], self.state[rows], self.motion.part(rows))
@@ -160,10 +161,10 @@ class ExternalModel:
     """(n,) [N·m], in which joints compare."""
     seconds: float = 0.0
     """Of the arm's own work that it rests on."""
-    split: Array = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "split", gravity_split(self.arm))
+    @cached_property
+    def split(self) -> Array:
+        return gravity_split(self.arm)
 
     def filter(self, rate: float) -> RowFilter:
         """For samples of this rate [Hz]."""
@@ -187,7 +188,7 @@ def stride_of(rate: float) -> int:
 
 def expected(rows: TorqueRows, change: Array) -> Array:
     n = rows.left.shape[1]
-    shared = INERTIAL * n
+    shared = LINK_PARAMETERS * n
     own = change[shared:].reshape(n, -1)
     return np.asarray(rows.by_link @ change[:shared] + (rows.by_joint * own).sum(-1))
 
@@ -200,7 +201,7 @@ def model_variance(columns: Array, factors: Array) -> Array:
 
 def _factors(covariance: Array, n: int) -> Array:
     """Factors (n, Q, Q) of each joint's part of the covariance of all parameters."""
-    shared = INERTIAL * n
+    shared = LINK_PARAMETERS * n
     own = (len(covariance) - shared) // n
     found = []
     for j in range(n):
@@ -247,19 +248,12 @@ def learn(arm: Arm, prior: ArmPrior, runs: Sequence[Samples], rate: float, scale
         np.concatenate([block_maxima(spread.deviation(x, s)[runs_of == k]) for k in range(len(pieces))])
         for spread, x, s in ((lasting, left, std), (sudden, change, sudden_std))
     )
-    seconds, shared = len(left) / ROWS_RATE, INERTIAL * arm.n
-    links = prior.links + (split @ mean[:shared]).reshape(arm.n, INERTIAL)
+    seconds, shared = len(left) / ROWS_RATE, LINK_PARAMETERS * arm.n
+    links = prior.links + (split @ mean[:shared]).reshape(arm.n, LINK_PARAMETERS)
     joints = prior.joints + mean[shared:].reshape(arm.n, -1)
     return ExternalModel(
         arm, links, joints, _factors(covariance, arm.n), lasting, sudden, (maxima[0], maxima[1]), scale, seconds
     )
-
-
-def joined(parts: Sequence[TorqueRows]) -> TorqueRows:
-    left, columns, state = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("left", "columns", "state")
-    )
-    return TorqueRows(left, columns, state, RigidMotion.joined([part.motion for part in parts]))
 
 
 def change_of(rows: TorqueRows) -> TorqueRows:
@@ -278,12 +272,16 @@ def drift(left: Array) -> Array:
 
 def slow_mean(left: Array) -> Array:
     """Mean of the rows before each one (S, …), exponentially over `SLOW`."""
-    out, share = np.empty_like(left), 1.0 - np.exp(-1.0 / (SLOW * ROWS_RATE))
-    value = left[0].copy()
+    out, value = np.empty_like(left), left[0].copy()
     for row, each in enumerate(left):
         out[row] = value
-        value += max(share, 1.0 / (row + 1)) * (each - value)
+        value += slow_weight(row + 1) * (each - value)
     return out
+
+
+def slow_weight(count: int) -> float:
+    """Weight of the newest of so many rows in their mean, exponentially over `SLOW`."""
+    return max(SLOW_SHARE, 1.0 / max(count, 1))
 
 
 FEWEST_ROWS = 100
@@ -327,7 +325,7 @@ class _Fit:
         self.prior, self.folds = prior, folds
         self.rows = joined(pieces)
         self.change = joined([change_of(piece) for piece in pieces])
-        n, self.shared = prior.n, INERTIAL * prior.n
+        n, self.shared = prior.n, LINK_PARAMETERS * prior.n
         covariance = _prior_covariance(prior)
         self.scale = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
         relative = covariance / np.outer(self.scale, self.scale) + 1e-9 * np.eye(len(covariance))

@@ -14,33 +14,33 @@ link's own momentum is its inertia in its bar frame, a constant, times its veloc
 inertia times the acceleration of gravity.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arm.arm import Arm
-from gcomp.arm.mass_moments import base_parameters
+from gcomp.arm.inertials import SIX
+from gcomp.arm.mass_moments import link_columns
 from gcomp.arrays import Array, Mask
 
-INERTIAL = 10
+LINK_PARAMETERS = 10
 """Parameters of a link about its origin, in its bar frame: m, mx, my, mz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def _by_parameter() -> Array:
     """Inertia (10, 6, 6) of each parameter alone: velocity (angular, linear) to momentum (angular, linear)."""
-    out = np.zeros((INERTIAL, 6, 6))
+    out = np.zeros((LINK_PARAMETERS, 6, 6))
     out[0, 3:, 3:] = np.eye(3)
     for k, unit in enumerate(np.eye(3), start=1):
         out[k, :3, 3:] = np.cross(unit, np.eye(3)).T
         out[k, 3:, :3] = -out[k, :3, 3:]
-    for k, (i, j) in enumerate(PAIRS, start=4):
+    for k, (i, j) in enumerate(zip(*SIX, strict=True), start=4):
         out[k, i, j] = out[k, j, i] = 1.0
     return out
 
 
 BY_PARAMETER = _by_parameter()
-BY_VELOCITY = BY_PARAMETER.transpose(2, 1, 0).reshape(6, 6 * INERTIAL)
+BY_VELOCITY = BY_PARAMETER.transpose(2, 1, 0).reshape(6, 6 * LINK_PARAMETERS)
 """The same from velocities (6) to the derivatives of the momentum by the parameters (6, 10)."""
 
 
@@ -68,12 +68,6 @@ class RigidMotion:
     def part(self, rows: slice | Mask) -> "RigidMotion":
         return RigidMotion(
             self.to_link[rows], self.origin[rows], self.moves[rows], self.screw[rows], self.screw_rate[rows]
-        )
-
-    @staticmethod
-    def joined(parts: "list[RigidMotion]") -> "RigidMotion":
-        return RigidMotion(
-            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RigidMotion))
         )
 
 
@@ -112,7 +106,7 @@ def _axes(arm: Arm, q: Array) -> Array:
 
 def momentum_terms(motion: RigidMotion, inertial: Array) -> tuple[Array, Array, Array]:
     """(p [N·m·s], ∂T/∂q − g [N·m], g [N·m]) (K, n) each, for links of inertial parameters (n, 10)."""
-    inertia = (inertial @ BY_PARAMETER.reshape(INERTIAL, 36)).reshape(-1, 6, 6)
+    inertia = (inertial @ BY_PARAMETER.reshape(LINK_PARAMETERS, 36)).reshape(-1, 6, 6)
     carried = _inwards(motion.to_link.swapaxes(-1, -2) @ (inertia @ motion.moves))
     by_screw = (motion.screw[..., None, :] @ carried)[..., 0, :]
     gravity = -by_screw[..., 1]
@@ -123,10 +117,12 @@ def momentum_regressors(motion: RigidMotion) -> tuple[Array, Array]:
     """Derivatives of the first two of `momentum_terms` by all inertial parameters, (K, n, 10 n) each."""
     count, n = motion.origin.shape[:2]
     own = motion.moves.swapaxes(-1, -2) @ BY_VELOCITY
-    own = own.reshape(count, n, 2, 6, INERTIAL).transpose(0, 1, 3, 2, 4).reshape(count, n, 6, 2 * INERTIAL)
-    base = (motion.to_link.swapaxes(-1, -2) @ own).reshape(count, n, 6, 2, INERTIAL)
-    momentum, weight = base.transpose(3, 0, 2, 1, 4).reshape(2, count, 6, n * INERTIAL)
-    carries = np.arange(n)[:, None] <= np.arange(n * INERTIAL) // INERTIAL
+    own = (
+        own.reshape(count, n, 2, 6, LINK_PARAMETERS).transpose(0, 1, 3, 2, 4).reshape(count, n, 6, 2 * LINK_PARAMETERS)
+    )
+    base = (motion.to_link.swapaxes(-1, -2) @ own).reshape(count, n, 6, 2, LINK_PARAMETERS)
+    momentum, weight = base.transpose(3, 0, 2, 1, 4).reshape(2, count, 6, n * LINK_PARAMETERS)
+    carries = np.arange(n)[:, None] <= np.arange(n * LINK_PARAMETERS) // LINK_PARAMETERS
     by_momentum = (motion.screw @ momentum) * carries
     return by_momentum, (motion.screw_rate @ momentum + motion.screw @ weight) * carries
 
@@ -147,23 +143,16 @@ def gravity_split(arm: Arm) -> Array:
     The second kind shows in motion alone, and how well gravity is known says nothing of it.
     """
     n = arm.n
-    to_beta = np.zeros((2 * n, INERTIAL * n))
-    none, unit = np.zeros((n, 3)), np.zeros(n)
+    to_beta = np.zeros((2 * n, n, LINK_PARAMETERS))
     for link in range(n):
-        mass = unit.copy()
-        mass[link] = 1.0
-        to_beta[:, INERTIAL * link] = base_parameters(arm, mass, none)
-        for axis in range(3):
-            moment = none.copy()
-            moment[link, axis] = 1.0
-            to_beta[:, INERTIAL * link + 1 + axis] = base_parameters(arm, unit, moment)
-    at = np.arange(n)[:, None] * INERTIAL
+        to_beta[:, link, 0], to_beta[:, link, 1:4] = link_columns(arm, link)
+    at = np.arange(n)[:, None] * LINK_PARAMETERS
     crosswise = (at + np.array([1, 2])).ravel()
-    others = (at + np.array([0, *range(3, INERTIAL)])).ravel()
-    columns = np.zeros((INERTIAL * n, INERTIAL * n))
+    others = (at + np.array([0, *range(3, LINK_PARAMETERS)])).ravel()
+    columns = np.zeros((LINK_PARAMETERS * n, LINK_PARAMETERS * n))
     columns[crosswise, np.arange(2 * n)] = 1.0
     columns[others, 2 * n + np.arange(8 * n)] = 1.0
-    columns[crosswise, 2 * n :] -= to_beta[:, others]
+    columns[crosswise, 2 * n :] -= to_beta.reshape(2 * n, -1)[:, others]
     return columns
 
 

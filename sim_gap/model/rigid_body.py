@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gcomp.arm.inertials import symmetric
+from gcomp.arm.inertials import SIX, symmetric
 from gcomp.arrays import Array, Mask
 
 CREEP = 0.01
@@ -197,7 +197,7 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
     out[0] = (lever * push).sum(0)
     out[1:4] = cross(lever, alpha) + cross(cross(lever, omega), omega) + cross(push, axis)
     gyro = cross(axis, omega)
-    for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
+    for column, (r, c) in enumerate(zip(*SIX, strict=True), start=4):
         value = axis[r] * alpha[c] + gyro[r] * omega[c]
         out[column] = value if r == c else value + axis[c] * alpha[r] + gyro[c] * omega[r]
     return out

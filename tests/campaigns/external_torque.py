@@ -48,7 +48,7 @@ from gcomp.arm.mass_moments import base_parameters
 from gcomp.external.contact import ContactDetector, threshold
 from gcomp.external.external_model import BEGINNING, CHUNK, ROWS_RATE, block_maxima
 from gcomp.external.filtered_rows import BANDWIDTH, RowFilter
-from gcomp.external.rigid_motion import INERTIAL
+from gcomp.external.rigid_motion import LINK_PARAMETERS
 from gcomp.external.wrench import force_found
 
 BASELINE = 600.0
@@ -89,7 +89,7 @@ class Arm:
 
 def maker_links(links, random) -> np.ndarray:
     """Of the arm file's links (n, 10), about the joints."""
-    out = np.zeros((len(links), INERTIAL))
+    out = np.zeros((len(links), LINK_PARAMETERS))
     for k, link in enumerate(links):
         mass, com = link.mass * (1 + MAKER * random.normal()), np.array(link.com)
         about = np.diag(link.inertia[:3]) + mass * (com @ com * np.eye(3) - np.outer(com, com))
