@@ -55,6 +55,17 @@ def joined(parts: Sequence[T]) -> T:
     return kind(*whole)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross product along the last axis; numpy's own is several times slower on short arrays."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = ay * bz - az * by
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
+    return out
+
+
 def frozen(instance: Any, **fields: Any) -> None:
     """Set fields of a frozen dataclass from its __post_init__; arrays become read-only."""
     for name, value in fields.items():

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gcomp.arrays import Array, as_array, frozen
+from gcomp.arrays import Array, as_array, cross, frozen
 from gcomp.errors import BadArray
 
 
@@ -72,20 +72,21 @@ class BarFrames:
     """w_i = z_{i-1} × g (K, n, 3) [m/s²]; its length is Γ_i."""
 
 
-def bar_frames(arm: Arm, q: Array) -> BarFrames:
-    """Bar frames at poses q (K, n) [rad]: B_1 = Rz(θ_1), B_{i+1} = B_i Rx(α_i) Rz(θ_{i+1})."""
+def bar_rotations(arm: Arm, q: Array) -> Array:
+    """Rotations of the bar frames at poses q (K, n) [rad]: B_1 = Rz(θ_1), B_{i+1} = B_i Rx(α_i) Rz(θ_{i+1})."""
     cos, sin = np.cos(q + arm.theta_offset), np.sin(q + arm.theta_offset)
-    rotation = np.empty((len(q), arm.n, 3, 3))
-    x, y, z = np.eye(3)[:, None, :]
-    for i in range(arm.n):
-        c, s = cos[:, i, None], sin[:, i, None]
-        rotation[:, i, :, 0] = c * x + s * y
-        rotation[:, i, :, 1] = c * y - s * x
-        rotation[:, i, :, 2] = z
-        ca, sa = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
-        x = rotation[:, i, :, 0]
-        y, z = (
-            ca * rotation[:, i, :, 1] + sa * rotation[:, i, :, 2],
-            ca * rotation[:, i, :, 2] - sa * rotation[:, i, :, 1],
-        )
-    return BarFrames(rotation, np.cross(rotation[..., 2], arm.gravity))
+    twist = np.append(0.0, arm.alpha[:-1])
+    ca, sa = np.cos(twist), np.sin(twist)
+    turn = np.empty((*q.shape, 3, 3))
+    turn[..., 0, 0], turn[..., 1, 0], turn[..., 2, 0] = cos, ca * sin, sa * sin
+    turn[..., 0, 1], turn[..., 1, 1], turn[..., 2, 1] = -sin, ca * cos, sa * cos
+    turn[..., 0, 2], turn[..., 1, 2], turn[..., 2, 2] = 0.0, -sa, ca
+    for i in range(1, arm.n):
+        turn[:, i] = turn[:, i - 1] @ turn[:, i]
+    return turn
+
+
+def bar_frames(arm: Arm, q: Array) -> BarFrames:
+    """Bar frames at poses q (K, n) [rad]."""
+    rotation = bar_rotations(arm, q)
+    return BarFrames(rotation, cross(rotation[..., 2], arm.gravity))

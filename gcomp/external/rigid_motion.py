@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gcomp.arm.arm import Arm
+from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.inertials import SIX
 from gcomp.arm.mass_moments import link_columns
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array, Mask, cross
 
 LINK_PARAMETERS = 10
 """Parameters of a link about its origin, in its bar frame: m, mx, my, mz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
@@ -74,12 +74,12 @@ class RigidMotion:
 def rigid_motion(arm: Arm, q: Array, velocity: Array) -> RigidMotion:
     """At positions (K, n) [rad] and velocities (K, n) [rad/s]."""
     count, n = q.shape
-    turn = _axes(arm, q)
+    turn = bar_rotations(arm, q)
     origin = np.zeros((count, n, 3))
     np.cumsum((turn @ arm.span[:, :, None])[:, :-1, :, 0], axis=1, out=origin[:, 1:])
     to_link = np.zeros((count, n, 6, 6))
     to_link[..., :3, :3] = to_link[..., 3:, 3:] = along = turn.swapaxes(-1, -2)
-    to_link[..., 3:, :3] = _cross(origin[:, :, None], along)
+    to_link[..., 3:, :3] = cross(origin[:, :, None], along)
     x, y, screw = (to_link[..., k::3, :3].reshape(count, n, 6) for k in range(3))
     moves = np.empty((count, n, 6, 2))
     np.cumsum(screw * velocity[..., None], axis=1, out=moves[..., 0])
@@ -88,20 +88,6 @@ def rigid_motion(arm: Arm, q: Array, velocity: Array) -> RigidMotion:
     screw_rate = moves[..., 1, :1] * x - moves[..., 0, :1] * y
     screw_rate[..., 3:] += moves[..., 4, :1] * x[..., :3] - moves[..., 3, :1] * y[..., :3]
     return RigidMotion(to_link, origin, moves, screw, screw_rate)
-
-
-def _axes(arm: Arm, q: Array) -> Array:
-    """Rotations of `bar_frames`, (K, n, 3, 3), with as few steps as few poses need."""
-    cos, sin = np.cos(q + arm.theta_offset), np.sin(q + arm.theta_offset)
-    twist = np.append(0.0, arm.alpha[:-1])
-    ca, sa = np.cos(twist), np.sin(twist)
-    turn = np.empty((*q.shape, 3, 3))
-    turn[..., 0, 0], turn[..., 1, 0], turn[..., 2, 0] = cos, ca * sin, sa * sin
-    turn[..., 0, 1], turn[..., 1, 1], turn[..., 2, 1] = -sin, ca * cos, sa * cos
-    turn[..., 0, 2], turn[..., 1, 2], turn[..., 2, 2] = 0.0, -sa, ca
-    for i in range(1, arm.n):
-        turn[:, i] = turn[:, i - 1] @ turn[:, i]
-    return turn
 
 
 def momentum_terms(motion: RigidMotion, inertial: Array) -> tuple[Array, Array, Array]:
@@ -132,7 +118,7 @@ def jacobian(motion: RigidMotion, link: int, point: Array) -> Array:
     at = motion.origin[:, link] + motion.rotation[:, link] @ point
     screw = motion.screw[:, : link + 1]
     out = np.zeros((len(at), 6, motion.screw.shape[1]))
-    out[:, :3, : link + 1] = (_cross(screw[..., :3], at[:, None]) + screw[..., 3:]).swapaxes(1, 2)
+    out[:, :3, : link + 1] = (cross(screw[..., :3], at[:, None]) + screw[..., 3:]).swapaxes(1, 2)
     out[:, 3:, : link + 1] = screw[..., :3].swapaxes(1, 2)
     return out
 
@@ -159,14 +145,3 @@ def gravity_split(arm: Arm) -> Array:
 def _inwards(values: Array) -> Array:
     """Sums over each link and those that it carries, (K, n, …)."""
     return np.cumsum(values[:, ::-1], axis=1)[:, ::-1]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis; numpy's own is several times slower on short arrays."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0] = ay * bz - az * by
-    out[..., 1] = az * bx - ax * bz
-    out[..., 2] = ax * by - ay * bx
-    return out

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm, bar_frames
-from gcomp.arrays import Array, as_array, as_batch, as_poses
+from gcomp.arrays import Array, as_array, as_batch, as_poses, cross
 from gcomp.gravity.batch import GravityModel
 from gcomp.gravity.regressor import regressor
 
@@ -34,7 +34,7 @@ def gravity_stiffness(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
     poses, leading = as_poses("q", q, arm.n)
     moments = as_array("beta", beta, (2 * arm.n,), finite=False).reshape(arm.n, 2)
     frames = bar_frames(arm, poses)
-    turned = np.cross(frames.rotation[..., 2], composite_moments(frames.rotation, moments))
+    turned = cross(frames.rotation[..., 2], composite_moments(frames.rotation, moments))
     lower = np.einsum("kid,kld->kil", turned, frames.lever)
     stiffness = np.tril(lower) + np.swapaxes(np.tril(lower, -1), -1, -2)
     return as_batch(stiffness, leading)

@@ -6,7 +6,7 @@ import numpy as np
 
 from gcomp.arm.arm import Arm, bar_frames
 from gcomp.arm.mass_moments import payload_columns
-from gcomp.arrays import Array
+from gcomp.arrays import Array, cross
 from gcomp.gravity.torque import composite_moments
 from gcomp.identify.parameters import Parameters, family_slices
 from gcomp.identify.readings import StaticReadings
@@ -48,7 +48,7 @@ def predict_and_jacobian(arm: Arm, parameters: Parameters, readings: StaticReadi
     torque = np.einsum("kid,kid->ki", frames.lever, composite)[counted]
     gain = parameters.gain[joint]
 
-    turned = np.cross(frames.rotation[..., 2], composite)
+    turned = cross(frames.rotation[..., 2], composite)
     below = np.einsum("pd,pld->pl", turned[row, joint], frames.lever[row])
     above = np.einsum("pd,pld->pl", frames.lever[row, joint], turned[row])
     stiffness = np.where(np.arange(n) <= joint[:, None], below, above) * gain[:, None]
