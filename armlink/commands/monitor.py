@@ -59,7 +59,7 @@ def monitor(
     from rich.live import Live
 
     from armlink.arm_file import load_arm
-    from armlink.bus.listening.joint_messages import ListeningBus, silence_of
+    from armlink.bus.listening.joint_messages import remarks_of, silence_of
     from armlink.bus.open import open_link_bus
     from armlink.commands.options import stated_bus
     from armlink.commands.output import write_json
@@ -83,7 +83,7 @@ def monitor(
             try:
                 while not refreshes or shown < refreshes:
                     answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
-                    answer["remarks"] = opened.said() if isinstance(opened, ListeningBus) else []
+                    answer["remarks"] = remarks_of(opened)
                     shown += 1
                     if console.is_terminal:
                         live.update(_table(title, answer), refresh=True)
@@ -147,7 +147,7 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     from rich.console import Group
     from rich.table import Table
 
-    from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
+    from armlink.drives.family import family
 
     table = Table(*COLUMNS, box=SIMPLE, title=title)
     for column in (1, 2, 3, 4, 7):
@@ -165,7 +165,7 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
         )
     bus = answer["bus"]
     line = f"SYNC {bus['rate_hz']:.1f} Hz, load {bus['load']:.1%}, {bus['frames']} frames, {bus['errors']} errors"
-    if all(joint["family"] == JOINT_STATE_FAMILY for joint in answer["joints"]):
+    if all(family(joint["family"]).traits.heard for joint in answer["joints"]):
         line = "; ".join((f"{bus['rate_hz']:.1f} readings a second", *answer["remarks"]))
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
     if bus["dropped"]:

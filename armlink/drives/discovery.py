@@ -13,7 +13,6 @@ from typing import Any
 
 from armlink.arm_file import parse_arm
 from armlink.bus.can_bus import CanBus
-from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
 from armlink.drives.family import family, family_names
 from armlink.drives.findings import FoundDrive, FoundDrives
 from armlink.drives.orders import DriveIdentity
@@ -67,7 +66,7 @@ class BusDrives:
     def __init__(self, bus: CanBus) -> None:
         """Search the bus; nothing but frames that read is sent."""
         searched = SearchedBus(bus)
-        found = {name: family(name).discovery for name in family_names() if name != JOINT_STATE_FAMILY}
+        found = {name: family(name).discovery for name in family_names() if not family(name).traits.heard}
         ways = {name: way for name, way in found.items() if way is not None}
         self.parts: list[FoundDrives] = []
         asked, others = list[str](), [f"{name} (found only by the ids in an arm file)" for name in found.keys() - ways]

@@ -1,6 +1,6 @@
 """Traits: what the drives of a family are like, so that the link knows what it may rely on."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 TorqueSource = Literal["link", "current"]
@@ -29,6 +29,8 @@ class Traits:
     """Cycles from one torque reading to the next."""
     kept: Silence | None = None
     """Of a drive that keeps on: its reaction once a keeper (`armlink.link.keeper`) has sent its `safe_frames`."""
+    heard: bool = False
+    """It is no drive on a bus: another program tells of the joint, and nothing can be asked or ordered."""
 
     def reaction(self, keeper: bool) -> Silence:
         """Its reaction to a silent host, with a keeper or without."""
@@ -36,6 +38,5 @@ class Traits:
 
     def as_json(self) -> dict[str, Any]:
         """By name, as `armlink drives --json` has them."""
-        shown = {**asdict(self), "bounds": list(self.bounds)}
-        del shown["torque_cycles"], shown["kept"]
-        return shown
+        shown = ("torque", "calibration", "silence", "bounds", "cadence", "frame")
+        return {name: list(value) if isinstance(value := getattr(self, name), tuple) else value for name in shown}

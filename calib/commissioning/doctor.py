@@ -9,7 +9,6 @@ from typing import get_args
 
 from armlink.arm_file import SIMULATED, ArmFile, BadKeys, Bus, bundled_arms, load_arm
 from armlink.bus.can_bus import CanBus
-from armlink.bus.listening.joint_messages import JOINT_STATE_FAMILY
 from armlink.bus.open import is_listening, open_link_bus, resolve_bus
 from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
@@ -104,11 +103,7 @@ def silence_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         return
     link = arm_file.require_link()
     joints = zip(link.joints, traits_of(groups), strict=True)
-    found = [
-        joint.name
-        for joint, traits in joints
-        if traits.reaction(link.keeper) == "keeps on" and joint.settings.family != JOINT_STATE_FAMILY
-    ]
+    found = [joint.name for joint, traits in joints if traits.reaction(link.keeper) == "keeps on" and not traits.heard]
     if found:
         yield SetupFinding(
             "warning",

@@ -326,3 +326,8 @@ def message_names(section: LinkSection) -> list[str]:
 def silence_of(bus: CanBus, otherwise: str) -> str:
     """Why no joint is heard on a bus, in words; `otherwise` of a bus with drives."""
     return bus.silence() if isinstance(bus, ListeningBus) else otherwise
+
+
+def remarks_of(bus: CanBus) -> list[str]:
+    """Parts of messages that were left out so far, one sentence each; of a bus with drives none."""
+    return bus.said() if isinstance(bus, ListeningBus) else []

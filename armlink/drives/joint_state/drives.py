@@ -16,7 +16,9 @@ from armlink.drives.traits import Traits
 from armlink.errors import BadInput
 from armlink.torque_calibration import Calibration
 
-TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="cyclic", frame="11")
+TRAITS = Traits(
+    torque="current", calibration="host", silence="keeps on", bounds=(), cadence="cyclic", frame="11", heard=True
+)
 """Of a joint whose effort comes from the motor; `frame` says nothing, since there are no CAN frames."""
 
 
