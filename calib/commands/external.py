@@ -86,6 +86,7 @@ def external(
         every = {label: each for path in paths or [] for label, each in load_recordings(path, stated).items()}
         return {label: in_joint_order(each, names, label) for label, each in every.items()}
 
+    console, answers = results(json_file), list[dict[str, Any]]()
     judged, free = loaded(recordings), list(loaded(baseline).values())
     place = parse_frame(frame, records)
     if learned is not None and not free:
@@ -97,7 +98,7 @@ def external(
             raise BadInput(f"--baseline: no recording has {SHORTEST:g} s without a gap: record for longer")
         if learned is not None:
             save_learned(learned, Learned(listener, place, per_hour))
-    console, answers = results(json_file), []
+            console.print(f"{learned} is written: it holds {listener.model.seconds:.0f} s of work without contact")
     every: list[Heard] = []
     if not free and learned is None:
         recorded = records.gravity is not None or records.calibration is not None

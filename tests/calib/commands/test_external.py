@@ -102,6 +102,7 @@ def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):
     assert (
         run(["external", "arm.xml", "--baseline", "free_1.csv", "--learned", "kept.npz", "--false-alarms", "2/h"]) == 0
     )
+    assert "kept.npz is written: it holds 39 s of work without contact" in capsys.readouterr().out
     answers = []
     for words in ("--baseline free_1.csv", "--learned kept.npz"):
         capsys.readouterr()
