@@ -11,15 +11,14 @@ from gcomp.design.selection import select, sweep_jacobian
 from gcomp.design.sweep_design import stop_combinations as limit_poses
 from gcomp.design.sweep_design import sufficient_levers
 from gcomp.gravity.torque import gravity_levers
-from gcomp.identify.parameters import Parameters, free_mask
+from gcomp.identify.parameters import GAIN_STD, POSITION_GAIN_STD, Parameters, free_mask
 
 SKETCH_STEPS = 5
 """Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
 TRAVEL_COST = 0.6
 """Price of a second of travel between two sweeps, as log determinant (docs/theory.md, section 7.4)."""
-PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
-"""Standard deviations before any reading of torque gain, position gain and place of the mass [m]
-(docs/theory.md, section 7.4)."""
+PRIOR_POINT = 0.2
+"""Standard deviation before any reading of the place of the mass [m] (docs/theory.md, section 7.4)."""
 UNKNOWN = ("gain", "offset", "position_gain", "beta", "rho")
 """Parameter families for which the stops are chosen."""
 
@@ -125,9 +124,9 @@ def _prior_std(guess: Parameters, sigma: Array) -> Array:
     """Standard deviations (6n + 3,) of the parameters before any reading."""
     ones = np.ones(len(sigma))
     return Parameters(
-        gain=PRIOR_GAIN * ones,
+        gain=GAIN_STD * ones,
         offset=100 * sigma,
-        position_gain=PRIOR_POSITION_GAIN * ones,
+        position_gain=POSITION_GAIN_STD * ones,
         position_offset=ones,
         beta=np.full(len(guess.beta), 10 * max(float(np.abs(guess.beta).max()), 1e-3)),
         rho=np.full(3, PRIOR_POINT),

@@ -12,7 +12,7 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
-from calib.plan.stop_selection import PRIOR_GAIN, Candidates, StopDesign, guessed_moments
+from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments
 from calib.plan.sweep_options import (
     PlannedArm,
     Poses,
@@ -32,7 +32,7 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.global_fit import predict_covariance
-from gcomp.identify.parameters import Parameters, Prior
+from gcomp.identify.parameters import GAIN_STD, Parameters, Prior
 from gcomp.identify.readings import StaticReadings
 
 SIDE = 0.05
@@ -92,7 +92,7 @@ def predicted_gain_std(
 
 def worst_gain_std(std: Array) -> float:
     """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
-    known = std[std < PRIOR_GAIN]  # beyond it more averaging cannot help
+    known = std[std < GAIN_STD]  # beyond it more averaging cannot help
     return float(known.max()) if len(known) else 0.0
 
 

@@ -116,7 +116,7 @@ def _starts(problem: LeastSquaresProblem, begin: Parameters) -> Iterator[Paramet
         bare = problem.readings.rows(~loaded)
         if bare.counted.any():
             plain = linear_start(problem.arm, bare, begin, problem.free)
-            found = Parameters.from_vector(solve(problem.on(bare), plain).vector, n)
+            found = Parameters.from_vector(solve(problem.on(bare).near(begin), plain).vector, n)
             yield linear_start(problem.arm, problem.readings, found, problem.free, keep_ratios=True)
     yield linear_start(problem.arm, problem.readings, begin, problem.free)
     yield begin

@@ -10,7 +10,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
 from gcomp.errors import BadArray
 from gcomp.identify.identifiability import Information, Spectrum, analyse
-from gcomp.identify.parameters import Parameters, Prior, free_mask, prior_vectors
+from gcomp.identify.parameters import GAIN_STD, POSITION_GAIN_STD, Parameters, Prior, free_mask, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
@@ -61,6 +61,16 @@ class LeastSquaresProblem:
 
     def on(self, readings: StaticReadings) -> "LeastSquaresProblem":
         return replace(self, readings=readings)
+
+    def near(self, guess: Parameters) -> "LeastSquaresProblem":
+        """With a prior about `guess` on gains that have none."""
+        gain = Prior(guess.gain, GAIN_STD * np.abs(guess.gain))
+        usual = {"gain": gain, "position_gain": Prior(guess.position_gain, POSITION_GAIN_STD)}
+        mean, std = prior_vectors(self.arm.n, usual)
+        given = np.isfinite(self.prior_std)
+        return replace(
+            self, prior_mean=np.where(given, self.prior_mean, mean), prior_std=np.where(given, self.prior_std, std)
+        )
 
     @property
     def reweighted(self) -> bool:
@@ -211,13 +221,12 @@ def fold(triangle: Array, rows: Array) -> Array:
     return triangle
 
 
-def linear_least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> tuple[Array, float]:
-    """(x (p,) that solves A x = b, norm of A x − b); x is of least norm in units (p,), rows [A | b] come in blocks.
+def linear_least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> Array:
+    """The x (p,) that solves A x = b, of least norm in units (p,); rows [A | b] come in blocks.
 
     A direction with less than `rcond` of the largest singular value in those units is left at zero.
     """
     triangle = np.zeros((0, len(unit) + 1))
     for rows in blocks:
         triangle = fold(triangle, rows)
-    solution: Array = unit * np.linalg.lstsq(triangle[:, :-1] * unit, triangle[:, -1], rcond=rcond)[0]
-    return solution, float(np.linalg.norm(triangle[:, :-1] @ solution - triangle[:, -1]))
+    return np.asarray(unit * np.linalg.lstsq(triangle[:, :-1] * unit, triangle[:, -1], rcond=rcond)[0])

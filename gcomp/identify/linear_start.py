@@ -14,10 +14,6 @@ from gcomp.identify.sensor_model import joint_positions
 
 SANE_GAIN_RATIO = 5.0
 """Factor to the start beyond which a gain counts as not determined by its readings (docs/theory.md, section 7.2)."""
-FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
-"""Common factors tried for such gains: position errors make (L) shrink κ towards zero but keep sign and ratios."""
-SMALLEST_RATIO = 1e-2
-"""Share of its start below which the sign of a κ is not determined either."""
 
 
 def linear_start(
@@ -27,24 +23,20 @@ def linear_start(
 
     κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; parameters not in `free` (6n + 3,)
     keep their start. Without a reference mass and with β unknown the equation has no scale: the gain of the joint whose
-    torque varies most keeps its start. Gains that their readings do not determine get the sign and the common factor
-    that fit best. `keep_ratios` leaves only a common factor of the gains free.
+    torque varies most keeps its start, and so do gains that their readings do not determine. `keep_ratios` leaves only
+    a common factor of the gains free.
     """
     places = family_slices(arm.n)
     free_gain = free[places["gain"]].copy()
     if free[places["beta"]].any() and not np.any(readings.load != 0):
         free_gain[_strongest(readings)] = False
     while True:
-        (kappa, omega, beta, rho), _ = _solve(arm, readings, start, free, free_gain, keep_ratios)
+        kappa, omega, beta, rho = _solve(arm, readings, start, free, free_gain, keep_ratios)
         ratio = kappa * start.gain
         lost = free_gain & ~((np.abs(ratio) > 1 / SANE_GAIN_RATIO) & (np.abs(ratio) < SANE_GAIN_RATIO))
         if not lost.any():
             break
         free_gain &= ~lost
-        signed = np.where(ratio < -SMALLEST_RATIO, -1.0, 1.0)
-        tried = [_with_gain(start, np.where(lost, start.gain * signed * factor, start.gain)) for factor in FACTORS]
-        costs = [_solve(arm, readings, each, free, free_gain, keep_ratios)[1] for each in tried]
-        start = tried[int(np.argmin(costs))]
     gain = np.where(free_gain, 1 / np.where(free_gain, kappa, 1.0), start.gain)
     found = {"gain": gain, "offset": omega * gain, "beta": beta, "rho": rho}
     vector = start.vector.copy()
@@ -55,8 +47,8 @@ def linear_start(
 
 def _solve(
     arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
-) -> tuple[list[Array], float]:
-    """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero if not free; norm of the weighted residual)."""
+) -> list[Array]:
+    """κ (n,), ω (n,), β (2n,), ρ (3,) of least norm; zero if not free."""
     n = arm.n
 
     def rows(block: StaticReadings) -> Array:
@@ -70,16 +62,10 @@ def _solve(
 
     unit, places = natural_units(arm, readings, start), family_slices(n)
     unit = np.concatenate([1 / unit[places["gain"]], unit[places["offset"]], unit[places["beta"].start :]])
-    solution, residual = linear_least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
+    solution = linear_least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
     if keep_ratios:
         solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
-    return np.split(solution, [n, 2 * n, 4 * n]), residual
-
-
-def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
-    vector = parameters.vector
-    vector[family_slices(len(gain))["gain"]] = gain
-    return Parameters.from_vector(vector, len(gain))
+    return np.split(solution, [n, 2 * n, 4 * n])
 
 
 def _linear_rows(

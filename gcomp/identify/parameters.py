@@ -13,6 +13,8 @@ from gcomp.identify.readings import StaticReadings
 
 FAMILIES = ("gain", "offset", "position_gain", "position_offset", "beta", "rho")
 """In the order of the parameter vector (6n + 3,)."""
+GAIN_STD, POSITION_GAIN_STD = 0.15, 0.02
+"""Standard deviations of a torque gain and a position gain before any reading, as shares."""
 
 
 def family_size(family: str, n: int) -> int:
