@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: listening referee external poses weigh long sound hands published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
+.PHONY: discovery listening referee external poses weigh long sound hands published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -74,6 +74,9 @@ creepwalk: .venv/.dev ## Long campaign outside make test: the procedure of the d
 
 listening: .venv/.dev ## Long campaign outside make test: minutes beside a ROS 2 publisher and a LeRobot-like loop (ARGS="--minutes 10 --only ros2")
 	$(BIN)/python tests/campaigns/listening.py $(ARGS)
+
+discovery: .venv/.dev ## Long campaign outside make test: each family's bus found, written, checked and swept in real time (ARGS="--only six-odrive")
+	$(BIN)/python tests/campaigns/discovery.py $(ARGS)
 
 poses: .venv/.dev ## Long campaign outside make test: gravity of drawn arms from poses at rest, and of 3,000 real poses (ARGS="--draws 40 --seed 0")
 	$(BIN)/python tests/campaigns/poses.py $(ARGS)

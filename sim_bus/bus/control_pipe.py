@@ -30,7 +30,7 @@ def obey(line: str, injector: Injector) -> None:
     arm, (word, _, text) = injector.arm, line.strip().partition(" ")
     text = text.strip()
     if word == "effect":
-        arm.set_effects([*arm.effects, parse_effect(text, arm.names)])
+        arm.set_effects([*arm.effects, *parse_effect(text, arm.names)])
     elif (word, text) == ("effects", "none"):
         arm.set_effects([])
     elif word == "drift":

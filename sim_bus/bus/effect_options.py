@@ -27,8 +27,11 @@ class SensorDrift:
     """Time of the change [s]."""
 
 
-def parse_effect(text: str, joints: Sequence[str]) -> EffectEntry:
-    """Parse one `--effect`; values without names are its parameters in order. Raises BadInput."""
+def parse_effect(text: str, joints: Sequence[str]) -> list[EffectEntry]:
+    """Parse one `--effect`; values without names are its parameters in order. Raises BadInput.
+
+    Without a joint it is an effect of the whole arm, or one of every joint.
+    """
     effect_id, colon, rest = text.partition(":")
     joint, second, values = rest.partition(":")
     if not (colon and second and effect_id and values):
@@ -38,13 +41,13 @@ def parse_effect(text: str, joints: Sequence[str]) -> EffectEntry:
     if joint and joint not in joints:
         raise BadInput(f"--effect {text!r}: there is no joint {joint!r}; there are {', '.join(joints)}")
     given: dict[str, Any] = {"effect": effect_id, **_parameters(text, effect_id, values.split(","))}
-    if joint:
-        given["joint"] = joint
+    named = [joint] if joint else joints if effects()[effect_id].per_joint else []
     try:
-        entry = EffectEntry.model_validate(given)
+        return [EffectEntry.model_validate(given | {"joint": each}) for each in named] or [
+            EffectEntry.model_validate(given)
+        ]
     except ValidationError as error:
         raise BadInput(f"--effect {text!r}: {describe(error)}") from None
-    return entry
 
 
 def _parameters(text: str, effect_id: str, items: list[str]) -> dict[str, Any]:

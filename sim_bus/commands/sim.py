@@ -14,7 +14,7 @@ def sim(
     bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; by default the bus of the arm file.")] = "",
     effect: Annotated[
         list[str] | None,
-        typer.Option(help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all."),
+        typer.Option(help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all joints, or the arm."),
     ] = None,
     drift: Annotated[
         list[str] | None,
@@ -73,7 +73,7 @@ def sim(
     described = load_arm(arm)
     if realism is not None:
         described = with_realism(described, realism, seed or 0)
-    entries = [parse_effect(text, described.joint_names) for text in effect or ()]
+    entries = [each for text in effect or () for each in parse_effect(text, described.joint_names)]
     drifts = [parse_drift(text, described.joint_names) for text in drift or ()]
     faults = [parse_fault(text, described.joint_names) for text in fault or ()]
     truth = Truth.of(described) if seed is None else Truth.draw(described, seed)

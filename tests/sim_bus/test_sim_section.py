@@ -130,12 +130,14 @@ def test_truth_is_drawn_within_its_ranges_and_frozen() -> None:
 
 def test_effects_and_drifts_of_the_command_line() -> None:
     joints = ("joint_1", "joint_2")
-    entry = parse_effect("friction.stribeck:joint_2:0.4,0.05", joints)
+    (entry,) = parse_effect("friction.stribeck:joint_2:0.4,0.05", joints)
     assert (entry.effect, entry.joint) == ("friction.stribeck", "joint_2")
     assert entry.parameters == {"breakaway": 0.4, "velocity": 0.05}
-    assert parse_effect("link.payload::0.5,0.1,0,0.2", joints).parameters == {"mass": 0.5, "com": [0.1, 0.0, 0.2]}
-    named = parse_effect("torque.crosstalk:joint_1:source=joint_2,coefficient=0.1", joints)
+    (payload,) = parse_effect("link.payload::0.5,0.1,0,0.2", joints)
+    assert payload.parameters == {"mass": 0.5, "com": [0.1, 0.0, 0.2]}
+    (named,) = parse_effect("torque.crosstalk:joint_1:source=joint_2,coefficient=0.1", joints)
     assert named.parameters == {"source": "joint_2", "coefficient": 0.1}
+    assert [each.joint for each in parse_effect("friction.coulomb::1.5", joints)] == ["joint_1", "joint_2"]
     drift = parse_drift("joint_1:1.03:0.3@20", joints)
     assert (drift.joint, drift.gain, drift.offset, drift.time) == ("joint_1", 1.03, 0.3, 20.0)
     for wrong in (
