@@ -45,6 +45,7 @@ class AskedDrives:
 
     def positions(self) -> dict[str, float]:
         self._bus.take = self._drives.take
+        self._bus.catch_up()
         found = dict(zip((each.address for each in self.found), self._drives.positions(self._bus), strict=True))
         silent = [address for address, position in found.items() if position != position]
         if silent:

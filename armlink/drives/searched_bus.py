@@ -35,6 +35,12 @@ class SearchedBus:
         self._receive(lambda *came: found.append(came), SEARCH_SECONDS)
         return found
 
+    def catch_up(self) -> None:
+        """Take what came while nobody read, as while a person turned a joint: it tells of where the joint was then."""
+        end = self.now() + SEARCH_SECONDS
+        while self.now() <= end and (frame := self.port.receive(0.0)) is not None:
+            self.take(*frame, self.now())
+
     def _receive(self, use: Callable[[int, bytes], T | None], seconds: float) -> T | None:
         """The first value that `use` gives for a frame that comes within so long."""
         end = self.now() + seconds

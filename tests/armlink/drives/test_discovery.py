@@ -221,3 +221,18 @@ def test_every_drive_tells_where_it_stands(arm, sent):
     told = list(found.positions().values())
     assert told == pytest.approx([each.motor.position for each in bench.simulated], abs=2e-3)
     assert all(reads(*frame) for frame in sent)
+
+
+@pytest.mark.parametrize("arm", ARMS[1:])
+def test_what_came_while_a_person_turned_a_joint_does_not_tell_where_it_is(arm):
+    bench = Bench(arm)
+    bus = LockStepBus(arm=bench.arm)
+    found = BusDrives(bus)
+    found.positions()
+    waiting = bus.open_port()
+    for _ in range(100):
+        bench.arm.turn_by_hand(2, 0.1)
+        waiting.receive(0.005)
+    bench.arm.turn_by_hand(2, 0.9)
+    told = list(found.positions().values())
+    assert told == pytest.approx([each.motor.position for each in bench.simulated], abs=2e-2)
