@@ -20,6 +20,7 @@ from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.live import LiveExternal
+from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
@@ -120,16 +121,8 @@ class ServiceView:
         told, frame = live.wrench(), live.learned.frame
         if told is None:
             return None
-        value, std = told.value[0], np.sqrt(np.diagonal(told.covariance[0]))
-        std = np.where(told.determined[0], std, math.nan)
-        return view.ExternalWrench(
-            joint=self._service.configuration.names[frame.link],
-            point=tuple(frame.point.tolist()),
-            force=tuple(value[:3].tolist()),
-            force_std=tuple(std[:3].tolist()),
-            moment=tuple(value[3:].tolist()),
-            moment_std=tuple(std[3:].tolist()),
-        )
+        place = {"joint": self._service.configuration.names[frame.link], "point": tuple(frame.point.tolist())}
+        return view.ExternalWrench.model_validate(place | wrench_of(told))
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""

@@ -53,7 +53,7 @@ class ExternalTorque:
             try:
                 if isinstance(found, Exception):
                     raise found
-                self.live, self.reason = LiveExternal(found, arm.require_link().rate), ""
+                self.live, self.reason = LiveExternal(found), ""
             except ArmlinkError as error:
                 self.reason = str(error)
 
