@@ -234,6 +234,6 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
         f"direction, {worst} along the worst"
     )
     for event in answer["events"]:
-        console.print(event_text(event))
+        console.print(f"{event['t']:9.2f} s  {event_text(event)}")
     if not answer["events"]:
         console.print("no contact")

@@ -46,7 +46,7 @@ def follow(arm: "ArmFile", source: str | None, learned: "Learned", seconds: floa
                 t, position, velocity, torque, warmth = (np.array(column) for column in zip(*samples, strict=True))
                 for event in live.take(t, position, velocity, torque, warmth[-1]):
                     told = event_of(event, arm.joint_names) | {"t": event.t - first, "told": event.told - first}
-                    out.print(event_text(told))
+                    out.print(f"{told['t']:9.2f} s  {event_text(told)}")
                     write({"event": told})
             if live.row is not None and live.row is not newest:
                 newest, rows = live.row, rows + 1

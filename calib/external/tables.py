@@ -58,13 +58,12 @@ def event_of(event: ContactEvent, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def event_text(event: dict[str, Any]) -> str:
-    """Of `event_of`, as one line for people."""
-    where = f"{event['t']:9.2f} s  {event['kind']}"
+    """Of `event_of`, for people."""
     if event["kind"] == "contact":
         told = f"at link {event['link']} ({event['probability']:.0%}), at least {event['least_force']:.1f} N"
     else:
         told = f"{event['mass']:+.2f} kg{' if it is a load' if event['kind'] == 'contact or load' else ''}"
-    return f"{where}  {told}; joints {', '.join(event['joints'])}"
+    return f"{event['kind']} {told}; joints {', '.join(event['joints'])}"
 
 
 def wrench_of(told: Wrench) -> dict[str, list[float]]:

@@ -53,6 +53,9 @@ WIDTH = 0.06
 """Half the width of a link [m]: a force acts so far beside the line between its joints."""
 
 
+EVENT_KINDS = ("contact", "load", "load put down", "contact or load")
+
+
 @dataclass(frozen=True)
 class ContactEvent:
     """A push that begins, or a load that changes."""
@@ -60,7 +63,7 @@ class ContactEvent:
     t: float
     """When it began [s]."""
     kind: str
-    """`contact`, `load`, `load put down`, or `contact or load` while no motion has told them apart."""
+    """Of `EVENT_KINDS`; `contact or load` while no motion has told them apart."""
     joints: tuple[int, ...]
     """Those whose torque it changes beyond what is expected, the most certain first."""
     link: int
