@@ -109,7 +109,9 @@ class LiveExternal:
             self._averaged = max(1, int(1.02 * period / float(np.median(np.diff(rows[:, 0])))))
         if len(rows) <= self._averaged:
             return rows[:0]
-        means = np.lib.stride_tricks.sliding_window_view(rows, self._averaged, axis=0).mean(axis=-1)
+        means = rows
+        if self._averaged > 1:
+            means = np.lib.stride_tricks.sliding_window_view(rows, self._averaged, axis=0).mean(axis=-1)
         self._next = max(self._next, float(means[0, 0]))
         even = np.arange(self._next, means[-1, 0] + 1e-6 * period, period)
         if len(even):
