@@ -2,8 +2,9 @@
 
     .venv/bin/python benchmarks/external_share.py [--part 10]
 
-Samples come in parts that end with the sample of a row, of which there are 25 a second. Prints JSON; times are the 5th,
-50th and 99th percentile of parts that have a row.
+Samples come in parts as from a bus, and go the way of the live command and of the daemon; there are 25 rows a second.
+Prints JSON; times are the 5th, 50th and 99th percentile of parts that end with the sample of a row, from the call with
+this sample to the row's value and wrench, by the clock and of the processor.
 """
 
 import argparse
@@ -14,16 +15,20 @@ import numpy as np
 
 from armlink.arm_file import load_arm
 from calib.arm.kinematics import gcomp_arm
+from calib.arm.stated_model import StatedModel
+from calib.external.arm_model import ArmListener, ArmRecords
+from calib.external.learned import Learned
+from calib.external.listening import WrenchFrame
+from calib.external.live import LiveExternal
 from calib.external.sound_arm import MOTOR, prior_of_model
-from gcomp.external.contact import ContactDetector
 from gcomp.external.external_model import ROWS_RATE, from_records, stride_of
-from gcomp.external.filtered_rows import Samples
-from gcomp.external.wrench import wrench
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.sim_section import sim_section
 
 RATE = 250.0
 SECONDS = 40.0
+FIRST = 11
+"""Samples until the first row; one every ten then."""
 
 
 def main() -> None:
@@ -44,18 +49,19 @@ def main() -> None:
     q = 0.4 * np.sin(t[:, None] * pace)
     v = 0.4 * pace * np.cos(t[:, None] * pace)
     torque = gravity_torque(arm, model.links.reshape(arm.n, 10)[:, 1:3].ravel(), q)
-    samples = Samples(q, v, torque, 0.0 * q)
-    made, detector, point = model.filter(RATE), ContactDetector(model), np.array([0.0, 0.0, 0.1])
-    waits, first = [], 1  # the first sample is the first row
+    records = ArmRecords(StatedModel(arm, None, None, None, arm_file))
+    frame = WrenchFrame(arm.n - 1, np.array([0.0, 0.0, 0.1]))
+    live = LiveExternal(Learned(ArmListener(model, records, "motor_torque", RATE, None), frame, 1.0))
+    waits, newest = [], live.row
     begun = time.process_time()
-    for begin in [0, *range(first, len(t), part)]:
-        rows = slice(begin, first if begin == 0 else begin + part)
+    for begin in [0, *range(FIRST, len(t), part)]:
+        rows = slice(begin, FIRST if begin == 0 else begin + part)
         at, cpu = time.perf_counter(), time.process_time()
-        filtered = made.rows(samples.part(rows))
-        if not len(filtered.by_link):
+        live.take(t[rows], q[rows], v[rows], torque[rows], None)
+        if live.row is newest:
             continue
-        judged, _ = detector.judge(t[rows][filtered.chosen], model.rows(filtered))
-        wrench(filtered.motion, arm.n - 1, point, judged.external, judged.std, model.lasting.precision)
+        live.wrench()
+        newest = live.row
         waits.append((time.perf_counter() - at, time.process_time() - cpu))
     spent = time.process_time() - begun
     wall, own = (1e3 * np.percentile([each[k] for each in waits], [5, 50, 99]) for k in (0, 1))

@@ -1,10 +1,12 @@
 """Answers for machines: JSON to a file or standard output."""
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from armlink.content.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole, writing
 from armlink.content.printable_text import printable_json
 
 
@@ -17,6 +19,26 @@ def write_json(path: Path | None, answer: Any) -> None:
         write_out(text)
     else:
         write_whole(path, text)
+
+
+@contextmanager
+def json_lines(path: Path | None) -> Iterator[Callable[[Any], None]]:
+    """A function that writes one answer as a line at once, to `path` as `write_json` has it."""
+    if path is None:
+        yield lambda answer: None
+    elif str(path) == "-":
+        yield lambda answer: write_out(_line(answer))
+    else:
+        with writing(path), path.open("w", encoding="utf-8", buffering=1) as file:
+
+            def write(answer: Any) -> None:
+                file.write(_line(answer))
+
+            yield write
+
+
+def _line(answer: Any) -> str:
+    return printable_json(_finite(answer), allow_nan=False) + "\n"
 
 
 def write_out(text: str) -> None:

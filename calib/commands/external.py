@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import reads_recordings
+from armlink.commands.options import LeRobot, OtherBus, Ros2, reads_recordings
 from calib.commands.options import ArmOrModel, ChainBase, ChainTip, JsonFile, Store, Tool
 
 if TYPE_CHECKING:
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 def external(
     arm: ArmOrModel,
     stated: "Corrections",
-    recordings: Annotated[list[str] | None, typer.Argument(help="Recordings to judge.")] = None,
+    recordings: Annotated[
+        list[str] | None, typer.Argument(help="Recordings to judge; without, the arm is listened to.")
+    ] = None,
     baseline: Annotated[
         list[str] | None,
         typer.Option(help="Recording of the arm's own work without contact, to learn from; may be repeated."),
@@ -43,6 +45,10 @@ def external(
             "The daemon reads external.npz of its state directory."
         ),
     ] = None,
+    bus: OtherBus = None,
+    ros2: Ros2 = None,
+    lerobot: LeRobot = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
     ] = None,
@@ -54,12 +60,15 @@ def external(
 ) -> None:
     """Tell what torque neither arm, tool nor friction explains, with 95 % bounds, and what touches the arm.
 
-    Without --baseline, bounds come from the arm's records alone.
+    Without recordings it listens to the arm while another program runs it, sends nothing, and tells until Ctrl-C;
+    with --json a line for each row and event. Exit status 3 if nothing is heard. Without --baseline or --learned, the
+    bounds of recordings come from the arm's records alone.
 
     Example: armlink external arm.yaml run.mcap --baseline free.mcap
     """
     import numpy as np
 
+    from armlink.commands.options import stated_bus
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
@@ -72,8 +81,17 @@ def external(
     from calib.external.tables import answer_of, require_writable, save_heard
     from calib.fit.pose_readings import in_joint_order
 
-    if not recordings and picture is None and not (learned and baseline):
-        raise BadInput("give recordings to judge, or --picture FILE.svg for the smallest force that is felt")
+    source = stated_bus(bus, ros2, lerobot)
+    listens = not recordings and picture is None and (source is not None or not (learned and baseline))
+    if source is not None and not listens:
+        raise BadInput(
+            f"external: {source} and {recordings[0] if recordings else picture}: give recordings or a live source"
+        )
+    if listens and not (learned or baseline):
+        raise BadInput(
+            "external: give recordings to judge, or --picture FILE.svg for the smallest force that is felt; to listen "
+            "to the arm give --learned FILE or --baseline RECORDING"
+        )
     if out is not None:
         require_writable(out)
         if not recordings:
@@ -99,6 +117,13 @@ def external(
         if learned is not None:
             save_learned(learned, Learned(listener, place, per_hour))
             console.print(f"{learned} is written: it holds {listener.model.seconds:.0f} s of work without contact")
+    if listens:
+        from calib.commands.external_live import follow
+
+        if records.stated.arm_file is None:
+            raise BadInput(f"{arm}: listening needs an arm file, which says how; `armlink new` makes one")
+        follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file)
+        return
     every: list[Heard] = []
     if not free and learned is None:
         recorded = records.gravity is not None or records.calibration is not None
@@ -195,6 +220,8 @@ def _records(arm: str, base: str | None, tip: str | None, tool: str | None, stor
 def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
     from rich.table import Table
 
+    from calib.external.tables import event_text
+
     table = Table(
         "joint", "external torque, RMS [N·m]", "95 % bound ± [N·m]", "at rest ± [N·m]", title=answer["recording"]
     )
@@ -207,11 +234,6 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
         f"direction, {worst} along the worst"
     )
     for event in answer["events"]:
-        where = f"{event['t']:9.2f} s  {event['kind']}"
-        if event["kind"] == "contact":
-            told = f"at link {event['link']} ({event['probability']:.0%}), at least {event['least_force']:.1f} N"
-        else:
-            told = f"{event['mass']:+.2f} kg{' if it is a load' if event['kind'] == 'contact or load' else ''}"
-        console.print(f"{where}  {told}; joints {', '.join(event['joints'])}")
+        console.print(f"{event['t']:9.2f} s  {event_text(event)}")
     if not answer["events"]:
         console.print("no contact")

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 CHANGES = ("drift", "effect", "payload")
 """Kinds of event that name a change; others say that there may be one, or that it is gone."""
-WAIT_SECONDS = 0.2
-"""Longest wait for a sample, between two looks at the time [s]."""
 
 
 def observe(
@@ -103,22 +101,7 @@ def recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]
 
 def _heard(arm: "ArmFile", bus: str | None, seconds: float) -> "Iterator[tuple[float, Array, Array]]":
     """Samples of a listener until the time is over or Ctrl-C; raises BusFault if none comes."""
-    import contextlib
+    from calib.commands.heard_samples import heard_samples
 
-    from armlink.bus.listening.joint_messages import silence_of
-    from armlink.bus.open import open_link_bus
-    from armlink.errors import BusFault
-    from armlink.link.listener import Listener
-
-    opened = open_link_bus(bus, arm.require_link())
-    heard = False
-    with Listener(arm, opened) as listener, contextlib.suppress(KeyboardInterrupt):
-        end = listener.clock.now() + (seconds or float("inf"))
-        while (remaining := end - listener.clock.now()) > 0:
-            sample = listener.next(min(remaining, WAIT_SECONDS))
-            if sample is not None:
-                heard = True
-                yield sample.t, sample.position, sample.torque
-        if not heard:
-            why = silence_of(opened, f"no SYNC was heard: is a host running {arm.name}?")
-            raise BusFault(f"{opened.channel_info}: {why}")
+    for together in heard_samples(arm, bus, seconds, lambda _, sample: (sample.t, sample.position, sample.torque)):
+        yield from together

@@ -78,7 +78,9 @@ class Service:
         self.diagnosis = DailyDiagnosis(
             self.configuration, environment, self.events, self.busiest, directory / "diagnosis"
         )
-        self.external = ExternalTorque(self.configuration, environment, directory / "external.npz")
+        self.external = ExternalTorque(
+            self.configuration, environment, directory / "external.npz", self.events, self.hub
+        )
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
             self.configuration, store, self.arm_state, self.journal, self.events, self.jobs, monotonic

@@ -20,10 +20,10 @@ from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.live import LiveExternal
+from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
-from gcomp.external.contact import ContactEvent
 from gcomp.external.external_model import NORMAL_95
 
 
@@ -86,10 +86,16 @@ class ServiceView:
         )
         return tuple(view.JointNow(**dict(zip(view.JointNow.model_fields, column, strict=True))) for column in columns)
 
+    @property
+    def _live(self) -> LiveExternal | None:
+        """External torque of now; None without, or where its newest row is old."""
+        live = self._service.external.live
+        return None if live is None or live.row is None or self._age(live.row.t) > LONGEST_PAUSE else live
+
     def _external(self) -> tuple[Array, Array]:
         """External torque and its 95 % bound (n,) [N·m]; NaN without."""
-        live = self._service.external.live
-        if live is None or live.row is None or self._age(live.row.t) > LONGEST_PAUSE:
+        live = self._live
+        if live is None or live.row is None:
             unknown = np.full(len(self._service.configuration.names), math.nan)
             return unknown, unknown
         return live.row.external, NORMAL_95 * live.row.std
@@ -98,38 +104,31 @@ class ServiceView:
         return max(self._service.environment.monotonic() - t, 0.0)
 
     def external(self) -> view.ExternalNow:
-        part, names = self._service.external, self._service.configuration.names
-        events = tuple(_external_event(time, event, names) for time, event in part.events)
+        part = self._service.external
+        told = view.ExternalNow(reason=part.reason, events=tuple(part.events), counts=part.counts)
         if part.live is None:
-            return view.ExternalNow(reason=part.reason, events=events)
+            return told
         torque, bound = self._external()
         row, learned = part.live.row, part.live.learned
-        return view.ExternalNow(
-            reason="" if row is not None else "no row of samples has come yet",
-            age_s=None if row is None else self._age(row.t),
-            baseline_s=learned.listener.model.seconds,
-            false_alarms_per_hour=learned.per_hour,
-            torque=tuple(torque.tolist()),
-            bound=tuple(bound.tolist()),
-            wrench=self._wrench(part.live),
-            load=part.live.load,
-            events=events,
-        )
+        now = {
+            "reason": "" if row is not None else "no row of samples has come yet",
+            "age_s": None if row is None else self._age(row.t),
+            "baseline_s": learned.listener.model.seconds,
+            "false_alarms_per_hour": learned.per_hour,
+            "torque": tuple(torque.tolist()),
+            "bound": tuple(bound.tolist()),
+            "wrench": self._wrench(part.live),
+            "load": part.live.load,
+        }
+        return view.ExternalNow.model_validate(dict(told) | now)
 
-    def _wrench(self, live: LiveExternal) -> view.ExternalWrench | None:
-        told, frame = live.wrench(), live.learned.frame
-        if told is None:
+    def _wrench(self, live: LiveExternal | None) -> view.ExternalWrench | None:
+        told = None if live is None else live.wrench()
+        if live is None or told is None:
             return None
-        value, std = told.value[0], np.sqrt(np.diagonal(told.covariance[0]))
-        std = np.where(told.determined[0], std, math.nan)
-        return view.ExternalWrench(
-            joint=self._service.configuration.names[frame.link],
-            point=tuple(frame.point.tolist()),
-            force=tuple(value[:3].tolist()),
-            force_std=tuple(std[:3].tolist()),
-            moment=tuple(value[3:].tolist()),
-            moment_std=tuple(std[3:].tolist()),
-        )
+        frame = live.learned.frame
+        place = {"joint": self._service.configuration.names[frame.link], "point": tuple(frame.point.tolist())}
+        return view.ExternalWrench.model_validate(place | wrench_of(told))
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""
@@ -212,13 +211,15 @@ class ServiceView:
 
     def snapshot(self) -> view.JointsItem:
         """The present joints as an item of the stream."""
-        environment = self._service.environment
+        environment, live = self._service.environment, self._live
         return view.JointsItem(
             time=environment.wall(),
             t=environment.monotonic(),
             state=self._service.state,
             bus=self._bus(),
             joints=self.joints(),
+            wrench=self._wrench(live),
+            load=None if live is None else live.load,
         )
 
     def publish(self) -> None:
@@ -236,18 +237,6 @@ class ServiceView:
                 counted |= {"rate_hz": 0.0, "load": 0.0}
         fault = arm_state.fault or arm_state.silent or None
         return view.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
-
-
-def _external_event(time: datetime, event: ContactEvent, names: tuple[str, ...]) -> view.ExternalEvent:
-    return view.ExternalEvent(
-        time=time,
-        kind=event.kind,
-        joints=tuple(names[j] for j in event.joints),
-        link=names[event.link],
-        probability=event.probability,
-        least_force=event.least_force,
-        mass=event.mass,
-    )
 
 
 def _point(

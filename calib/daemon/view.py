@@ -202,6 +202,8 @@ class ExternalNow(Answer):
     """Mass that the arm was found to have taken up [kg]."""
     events: tuple[ExternalEvent, ...] = ()
     """The newest ones, oldest first."""
+    counts: dict[str, int] = {}
+    """Number of events of each kind since the daemon started."""
 
 
 class EventRecord(Answer):
@@ -326,6 +328,17 @@ class JointsItem(Answer):
     state: State
     bus: BusHealth
     joints: tuple[JointNow, ...]
+    wrench: ExternalWrench | None = None
+    """As GET /api/external has it."""
+    load: Number = None
+    """Likewise [kg]."""
+
+
+class ContactItem(Answer):
+    """Item of the stream, one per contact and load: at once, while the event log has but one of a kind a minute."""
+
+    type: Literal["contact"] = "contact"
+    contact: ExternalEvent
 
 
 class EventItem(Answer):
@@ -335,7 +348,7 @@ class EventItem(Answer):
     event: EventRecord
 
 
-StreamItem = Annotated[JointsItem | EventItem, Field(discriminator="type")]
+StreamItem = Annotated[JointsItem | ContactItem | EventItem, Field(discriminator="type")]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from calib.external.arm_model import ArmListener, ArmRecords
 from calib.external.listening import WrenchFrame
 from gcomp.external.external_model import ExternalModel, Spread
 
-SCHEMA = "armlink.external-learned/1"
+SCHEMA = "armlink.external-learned/2"
 SPREADS, ARRAYS = ("lasting", "sudden"), ("links", "joints", "factors", "scale")
 OF_SPREAD = ("weights", "still", "moving", "correlation")
 
@@ -54,7 +54,7 @@ def load_learned(path: Path, records: ArmRecords) -> Learned:
         with np.load(path, allow_pickle=False) as file:
             content = dict(file)
         if str(content["schema"]) != SCHEMA:
-            raise BadInput(f"{path}: schema is {content['schema']}, expected {SCHEMA}")
+            raise BadInput(f"{path}: schema is {content['schema']}, expected {SCHEMA}: learn again with --baseline")
         if tuple(content["names"].tolist()) != arm.names or tuple(content["records"].tolist()) != _ids(records):
             raise BadInput(f"{path}: was learned of another arm, or with other records: learn again with --baseline")
         spreads = [Spread(*(content[f"{spread}_{name}"] for name in OF_SPREAD)) for spread in SPREADS]

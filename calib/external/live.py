@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armlink.errors import BadInput
 from calib.external.even_samples import LONGEST_GAP
 from calib.external.learned import Learned
 from gcomp.arrays import Array
@@ -27,15 +26,17 @@ class ExternalRow:
     motion: RigidMotion
 
 
-class LiveExternal:
-    """`take` samples at the bus's rate; `row` is the newest row, None while there is none."""
+MEASURED_SAMPLES = 10
+"""From which the time between two of them is taken."""
 
-    def __init__(self, learned: Learned, rate: float) -> None:
-        """`rate` [Hz] is the bus's; raises BadInput if it is no multiple of that of the samples learned from."""
-        listener = learned.listener
-        self._group = max(1, round(rate / listener.rate))
-        if abs(rate / (self._group * listener.rate) - 1.0) > 0.02:
-            raise BadInput(f"learned from {listener.rate:g} samples a second, which do not fit {rate:g} on the bus")
+
+class LiveExternal:
+    """`take` samples as they come; `row` is the newest row, None while there is none.
+
+    Samples of any rate are taken at even times, as those of recordings are.
+    """
+
+    def __init__(self, learned: Learned) -> None:
         self.learned = learned
         self.restart()
 
@@ -44,7 +45,12 @@ class LiveExternal:
         model = self.learned.listener.model
         self._filter: RowFilter = model.filter(self.learned.listener.rate)
         self._detector = ContactDetector(model, self.learned.per_hour, self.learned.frame.point)
-        self._left = np.empty((0, 1 + 3 * model.arm.n))
+        self._taken = np.empty((0, 1 + 3 * model.arm.n))
+        """Samples that later values rest on."""
+        self._averaged = 0
+        """How many samples go into one value; 0 before that is known."""
+        self._next = -np.inf
+        """Time of the next value [s]."""
         self._last: Array | None = None
         self.row: ExternalRow | None = None
 
@@ -63,20 +69,20 @@ class LiveExternal:
         taken = taken[np.isfinite(position).all(1) & np.isfinite(torque).all(1)]
         if not len(taken):
             return []
-        before = self._left[-1] if len(self._left) else self._last
-        if before is not None and np.diff(taken[:, 0], prepend=before[0]).max() > LONGEST_GAP:
+        before = self._taken[-1, 0] if len(self._taken) else taken[0, 0] - LONGEST_GAP
+        steps = np.diff(taken[:, 0], prepend=before)
+        parted = np.flatnonzero((steps > LONGEST_GAP) | (steps <= 0.0))
+        if len(parted):
             self.restart()
-        taken = np.concatenate([self._left, taken])
-        whole = len(taken) // self._group * self._group
-        self._left = taken[whole:]
-        if not whole:
+            taken = taken[parted[-1] :]
+        values = self._even(taken)
+        if not len(values):
             return []
-        means = taken[:whole].reshape(-1, self._group, taken.shape[1]).mean(axis=1)
-        q, v, torque = means[:, 1 : 1 + n], means[:, 1 + n : 1 + 2 * n], means[:, 1 + 2 * n :]
+        q, v, torque = values[:, 1 : 1 + n], values[:, 1 + n : 1 + 2 * n], values[:, 1 + 2 * n :]
         if not np.isfinite(v).all():
             first = q[:1] if self._last is None else self._last[None, 1 : 1 + n]
             v = np.diff(q, axis=0, prepend=first) * rate
-        self._last = means[-1]
+        self._last = values[-1]
         calibration = listener.records.calibration
         if calibration is not None:
             q, v = calibration.angle(q), v * calibration.values("position_gain", 1.0)
@@ -86,12 +92,34 @@ class LiveExternal:
         filtered = self._filter.rows(Samples(q, v, torque, warmth))
         if not len(filtered.by_link):
             return []
-        when = means[filtered.chosen, 0]
+        when = values[filtered.chosen, 0]
         judged, events = self._detector.judge(when, listener.model.rows(filtered))
         self.row = ExternalRow(
             float(when[-1]), judged.external[-1], judged.std[-1], filtered.motion.part(slice(-1, None))
         )
         return events
+
+    def _even(self, taken: Array) -> Array:
+        """Rows (K, 1 + 3n) at even times, of all samples so far: means over a period where they come faster."""
+        period = 1.0 / self.learned.listener.rate
+        self._taken = rows = np.concatenate([self._taken, taken])
+        if not self._averaged:
+            if len(rows) < MEASURED_SAMPLES:
+                return rows[:0]
+            self._averaged = max(1, int(1.02 * period / float(np.median(np.diff(rows[:, 0])))))
+        if len(rows) <= self._averaged:
+            return rows[:0]
+        means = rows
+        if self._averaged > 1:
+            means = np.lib.stride_tricks.sliding_window_view(rows, self._averaged, axis=0).mean(axis=-1)
+        self._next = max(self._next, float(means[0, 0]))
+        even = np.arange(self._next, means[-1, 0] + 1e-6 * period, period)
+        if len(even):
+            self._next = float(even[-1]) + period
+        self._taken = rows[max(int(np.searchsorted(means[:, 0], self._next)) - 1, 0) :]
+        place = np.clip(np.searchsorted(means[:, 0], even, side="right") - 1, 0, len(means) - 2)
+        share = (even - means[place, 0]) / (means[place + 1, 0] - means[place, 0])
+        return np.asarray(means[place] + share[:, None] * (means[place + 1] - means[place]))
 
     def wrench(self) -> Wrench | None:
         """Of the newest row at the frame learned for."""

@@ -13,6 +13,7 @@ from calib.external.listening import Heard
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactEvent
 from gcomp.external.external_model import NORMAL_95
+from gcomp.external.wrench import Wrench
 
 AXES = ("x", "y", "z")
 SUFFIXES = (".csv", ".mcap")
@@ -54,6 +55,22 @@ def event_of(event: ContactEvent, names: tuple[str, ...]) -> dict[str, Any]:
         "least_force": event.least_force,
         "mass": event.mass,
     }
+
+
+def event_text(event: dict[str, Any]) -> str:
+    """Of `event_of`, for people."""
+    if event["kind"] == "contact":
+        told = f"at link {event['link']} ({event['probability']:.0%}), at least {event['least_force']:.1f} N"
+    else:
+        told = f"{event['mass']:+.2f} kg{' if it is a load' if event['kind'] == 'contact or load' else ''}"
+    return f"{event['kind']} {told}; joints {', '.join(event['joints'])}"
+
+
+def wrench_of(told: Wrench) -> dict[str, list[float]]:
+    """Force [N] and moment [N·m] of one row with their standard deviations, NaN along axes that joints do not show."""
+    std = np.where(told.determined[0], np.sqrt(np.diagonal(told.covariance[0])), np.nan)
+    parts = (("force", slice(3)), ("moment", slice(3, 6)))
+    return {f"{name}{end}": x[part].tolist() for name, part in parts for end, x in (("", told.value[0]), ("_std", std))}
 
 
 def columns_of(heard: Heard) -> dict[str, Array]:

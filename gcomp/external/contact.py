@@ -53,6 +53,9 @@ WIDTH = 0.06
 """Half the width of a link [m]: a force acts so far beside the line between its joints."""
 
 
+EVENT_KINDS = ("contact", "load", "load put down", "contact or load")
+
+
 @dataclass(frozen=True)
 class ContactEvent:
     """A push that begins, or a load that changes."""
@@ -60,7 +63,7 @@ class ContactEvent:
     t: float
     """When it began [s]."""
     kind: str
-    """`contact`, `load`, `load put down`, or `contact or load` while no motion has told them apart."""
+    """Of `EVENT_KINDS`; `contact or load` while no motion has told them apart."""
     joints: tuple[int, ...]
     """Those whose torque it changes beyond what is expected, the most certain first."""
     link: int
@@ -196,7 +199,7 @@ class ContactDetector:
             lasted = opened.count >= 2 * LASTING_ROWS and deviation < self.lasting_limit
             if self._open is opened and (lasted or opened.quiet >= ENDED_ROWS):
                 if opened.event is not None and opened.event.kind == "contact or load" and not lasted:
-                    yield replace(opened.event, kind="contact", mass=0.0, told=t)  # no load is gone so soon
+                    yield from self._end(opened, opened.event, t)
                 self._open, self._slow = None, external.copy()
 
     def _follow(
@@ -230,9 +233,10 @@ class ContactDetector:
         weight = np.exp(by_link - by_link.max())
         link = int(np.argmax(by_link))
         likelihood, load = load_likelihood(recent[-1][2], self.tool, change, covariance)
+        opened.decided = _Decided(change, covariance, recent[-1][2], float(by_link.max() + np.log(weight.mean())))
         size = np.abs(change) / std
         order = np.argsort(-size)
-        odds = float(by_link.max() + np.log(weight.mean()) - likelihood)
+        odds = opened.decided.by_contact - likelihood
         kind = "load" if load > 0.0 else "load put down"
         if odds > -EVIDENCE:
             kind = "contact" if odds > EVIDENCE else "contact or load"
@@ -243,6 +247,25 @@ class ContactDetector:
             opened.t, kind, tuple(int(j) for j in order if size[j] > ONE_SIDED_95) or (int(order[0]),), link,
             float(weight[link] / weight.sum()), odds, least, mass, t,
         )  # fmt: skip
+
+    def _end(self, opened: "_OpenEvent", event: ContactEvent, t: float) -> Iterator[ContactEvent]:
+        """Tell whether an event that no longer deviates was a contact that ended, and no load that this pose hardly shows.
+
+        Odds are those of both changes, the one decided by and the one left, which is none after a contact.
+        """
+        before, recent = opened.decided, opened.rows[-ENDED_ROWS:]
+        assert before is not None
+        change, (_, std, columns) = np.mean([each[0] for each in recent], axis=0), recent[-1]
+        spread = self.model.sudden if opened.by_change else self.model.lasting
+        n, covariance = len(std), spread.correlation * np.outer(std, std)
+        both = np.zeros((2 * n, 2 * n))
+        both[:n, :n], both[n:, n:] = before.covariance, covariance
+        by_load, _ = load_likelihood(
+            np.vstack([before.columns, columns]), self.tool, np.append(before.change, change), both
+        )
+        odds = before.by_contact + _normal(change, covariance) - by_load
+        if odds > EVIDENCE:
+            yield replace(event, kind="contact", mass=0.0, odds=odds, told=t)
 
     def _load(self, opened: "_OpenEvent") -> Array | None:
         """Load (4,) that explains all rows of an event, if one does."""
@@ -267,6 +290,20 @@ class ContactDetector:
         return taken if misfit < ENDED * limit and possible else None
 
 
+@dataclass(frozen=True, eq=False)
+class _Decided:
+    """By what an event's cause was decided."""
+
+    change: Array
+    """(n,) [N·m]."""
+    covariance: Array
+    """Of the change without a cause (n, n)."""
+    columns: Array
+    """Of a load (n, 4)."""
+    by_contact: float
+    """Logarithm of its likelihood by a contact."""
+
+
 @dataclass
 class _OpenEvent:
     """An event that goes on."""
@@ -280,6 +317,7 @@ class _OpenEvent:
     count: int = 0
     quiet: int = 0
     event: ContactEvent | None = None
+    decided: _Decided | None = None
 
 
 def contact_likelihood(

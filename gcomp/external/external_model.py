@@ -95,15 +95,16 @@ def rows_of(filtered: FilteredRows, split: Array, joints: Array) -> TorqueRows:
 
 
 def _state(state: Array) -> Array:
-    """Components of a joint's variance: constant, of its own state (S, n, 4), and of how the whole arm moves."""
+    """Components of a joint's variance: constant, of its own state (S, n, 5), and of how the whole arm moves."""
     out = np.empty((*state.shape[:-1], COMPONENTS - 1))
     out[..., 0], out[..., 1:3] = 1.0, state[..., :2]
-    out[..., 3:5] = (state[..., 2:] / (SPEED, PUSH)) ** 2
+    out[..., 3:5] = (state[..., 2:4] / (SPEED, PUSH)) ** 2
     out[..., 5:7] = out[..., 3:5].mean(axis=1, keepdims=True)
+    out[..., 7] = state[..., 4] ** 2
     return out
 
 
-COMPONENTS = 8
+COMPONENTS = 9
 """Those of `_state`, and the model's own."""
 
 
@@ -400,7 +401,7 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
         rest = state[:, j, 1] > 0.5
         for chosen, out in ((rest, still), (~rest, moving)):
             if chosen.sum() >= FEWEST_ROWS:
-                out[j] = _factor_of_95(left[chosen, j] ** 2, own[chosen, j], known[chosen, j])
+                out[j] = factor_of_95(left[chosen, j], own[chosen, j], known[chosen, j])
         if rest.sum() < FEWEST_ROWS:
             still[j] = moving[j]
         if (~rest).sum() < FEWEST_ROWS:
@@ -413,10 +414,15 @@ def _spread(state: Array, model: Array, left: Array) -> tuple[Spread, Array]:
     return Spread(weights, still, moving, second / np.outer(size, size)), std
 
 
-def _factor_of_95(square: Array, own: Array, known: Array) -> float:
-    """Factor f with which 95 % of squares lie within the bounds of variances f² own + known."""
-    needed = np.sqrt(np.maximum(square / NORMAL_95**2 - known, 0.0) / own)
-    return float(np.clip(np.quantile(needed, 0.95), *FACTORS))
+def factor_of_95(left: Array, own: Array, known: Array) -> float:
+    """Factor f with which a new row lies within the bounds of variances f² own + known in 95 %.
+
+    Of k independent values the r-th smallest is not exceeded by a new one with probability r / (k + 1). All rows of a
+    rest are one such value: the same friction holds them.
+    """
+    needed = np.sqrt(np.maximum((left / NORMAL_95) ** 2 - known, 0.0) / own)
+    independent = len(needed) / _repeats(needed)
+    return float(np.clip(np.quantile(needed, min(0.95 * (1.0 + 1.0 / independent), 1.0)), *FACTORS))
 
 
 def variance_components(parts: Array, square: Array) -> Array:

@@ -23,9 +23,9 @@ PRESLIDING = (0.003, 0.03)
 """Ways over which friction turns round with the direction [rad]: of gears of little, and of much wind-up."""
 STRIBECK_SPEED = 0.1
 """Speed over which friction falls from its value at breakaway [rad/s]."""
-STATES = ("still", "turning", "speed", "push")
+STATES = ("still", "turning", "speed", "push", "held")
 """1 at rest and 0 in motion; 1 while friction turns round and 0 once the joint has moved on; speed [rad/s];
-acceleration [rad/s²]."""
+acceleration [rad/s²]; gravity's torque that a joint at rest holds [N·m], with which its friction grows."""
 REMEMBERED = 0.15
 """Time constant with which a state is forgotten [s]: what the filter, and what gives way, still show of it."""
 THINNED = 50.0
@@ -77,7 +77,7 @@ class FilteredRows:
     by_link: Array
     """Derivatives of `links` by the links' parameters (S, n, 10 n), at every `stride`-th sample."""
     state: Array
-    """How a joint moves or moved just before, `STATES`, (K, n, 4)."""
+    """How a joint moves or moved just before, `STATES`, (K, n, 5)."""
     chosen: slice
     """Those samples."""
     motion: RigidMotion
@@ -162,9 +162,10 @@ class RowFilter:
         out[..., len(JOINT_COLUMNS) :] = np.sqrt(2.0 / WAVES) * waves[:, None]
         state[..., 0] = np.exp(-((pace / 0.2) ** 2))
         state[..., 1], state[..., 2] = 1.0 - wide**2, speed
+        state[..., 4] = state[..., 0] * np.abs(gravity)
 
     def _remembered(self, state: Array) -> Array:
-        """States (K, n, 4), each at its largest of the time that counts."""
+        """States (K, n, 5), each at its largest of the time that counts."""
         keep, out = float(np.exp(-1.0 / (REMEMBERED * self.rate))), np.empty_like(state)
         for begin in range(0, len(state), AT_ONCE):
             part = state[begin : begin + AT_ONCE]

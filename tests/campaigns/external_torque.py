@@ -337,7 +337,8 @@ def main() -> int:
 
 
 def shares(outcomes: list[Outcome]) -> tuple[float, float]:
-    return tuple(float(np.mean(np.concatenate([getattr(o, k) for o in outcomes]))) for k in ("rest", "moving"))
+    """Of rows within their bounds; arms have different numbers of joints."""
+    return tuple(float(np.mean(np.concatenate([getattr(o, k).ravel() for o in outcomes]))) for k in ("rest", "moving"))
 
 
 def told(outcomes: list[Outcome]) -> str:

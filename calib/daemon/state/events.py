@@ -10,11 +10,11 @@ from datetime import datetime
 from typing import Any
 
 from calib.daemon.state.journal import Journal
-from calib.daemon.view import EventItem, EventRecord, JointsItem
+from calib.daemon.view import ContactItem, EventItem, EventRecord, JointsItem
 from calib.observer.decision import Event
 from calib.observer.evidence import DRIFT
 
-Item = JointsItem | EventItem
+Item = JointsItem | ContactItem | EventItem
 
 
 class Client:

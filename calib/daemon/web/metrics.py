@@ -26,6 +26,8 @@ JOINT = (
     ("model_torque", "joint_model_torque_newton_metres", "Gravity model at this position."),
     ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful at rest."),
     ("temperature", "joint_temperature_celsius", "Temperature of the drive, if it reports one."),
+    ("external_torque", "joint_external_torque_newton_metres", "Torque with which the surroundings push the joint."),
+    ("external_bound", "joint_external_bound_newton_metres", "Half width of its 95 % interval."),
     ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
@@ -48,6 +50,12 @@ class DaemonCollector(Collector):
         yield from _of_status(status)
         yield from _of_joints(JOINT, self._view.joints())
         yield from _of_joints(ESTIMATE, self._view.estimates())
+        contacts = CounterMetricFamily(
+            PREFIX + "contacts", "Contacts and loads since the daemon started.", labels=["kind"]
+        )
+        for kind, count in self._view.external().counts.items():
+            contacts.add_metric([kind], count)
+        yield contacts
         yield GaugeMetricFamily(PREFIX + "stream_clients", "Present clients of the stream.", self._streams.clients)
         yield CounterMetricFamily(
             PREFIX + "stream_cut_off",

@@ -59,7 +59,8 @@ NOT_NOW: dict[int | str, dict[str, Any]] = {
 }
 STREAM: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Server-sent events: `joints` (a JointsItem, 10 Hz) and `event` (an EventItem, with its id).",
+        "description": "Server-sent events: `joints` (a JointsItem, 10 Hz), `contact` (a ContactItem) and `event` (an "
+        "EventItem, with its id).",
         "content": {"text/event-stream": {"schema": {"type": "string"}}},
     }
 }

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from fastapi.responses import StreamingResponse
 
-from calib.daemon.view import DaemonView, EventItem, EventRecord, JointsItem
+from calib.daemon.view import ContactItem, DaemonView, EventItem, EventRecord, JointsItem
 from calib.daemon.web.connection import PATIENCE_SECONDS, Receive, Scope, Send, peer_of, until_gone
 from calib.daemon.web.history import Histories
 
@@ -84,7 +84,7 @@ class Streams:
             await _send(send, RETRY)
             after = await self._catch_up(send, after)
             while True:
-                item: JointsItem | EventItem | None = None
+                item: JointsItem | ContactItem | EventItem | None = None
                 with suppress(TimeoutError):
                     async with asyncio.timeout(PATIENCE_SECONDS / 2):
                         item = await subscription.get()
@@ -92,6 +92,8 @@ class Streams:
                     await _send(send, b": nothing new\n\n")
                 elif isinstance(item, JointsItem):
                     await _send(send, self.encode(item))
+                elif isinstance(item, ContactItem):
+                    await _send(send, b"event: contact\ndata: " + item.model_dump_json().encode() + b"\n\n")
                 elif item.event.id > after:  # including those that a slow client's queue has dropped before it
                     after = await self._catch_up(send, after)
         finally:

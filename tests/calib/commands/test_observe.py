@@ -1,56 +1,23 @@
 """armlink observe: a drift of an arm that another program commands, heard from messages or found in a recording."""
 
 import json
-from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fast_daemon import FastDaemon
+from program_messages import ProgramMessages
 
 from armlink import cli
 from armlink.arm_file import load_arm
 from armlink.bus import open as bus_open
-from armlink.bus.listening.joint_messages import JointStateMessage, ListeningBus
+from armlink.bus.listening.joint_messages import ListeningBus
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from calib.commands.observe import recorded
 
 SECONDS, BEFORE = 300.0, 60.0
-
-
-class Messages:
-    """Messages of a program that commands the fast arm; time is theirs."""
-
-    lost = 0
-
-    def __init__(self, names: tuple[str, ...], pieces: Iterator[Any]) -> None:
-        self._names, self._pieces, self._messages = names, pieces, deque[JointStateMessage]()
-        self._now = 0.0
-
-    def now(self) -> float:
-        return self._now
-
-    def sleep_until(self, instant: float) -> None:
-        self._now = max(self._now, instant)
-
-    def take(self) -> list[JointStateMessage]:
-        if not self._messages:
-            for t, position, torque in zip(*next(self._pieces, ((), (), ())), strict=True):
-                self._messages.append(
-                    JointStateMessage("driver", t, t, self._names, position.tolist(), (), torque.tolist())
-                )
-        found = []
-        while self._messages and self._messages[0].arrived <= self._now:
-            found.append(self._messages.popleft())
-        return found
-
-    def absence(self) -> str:
-        return ""
-
-    def close(self) -> None: ...
 
 
 @pytest.fixture
@@ -70,7 +37,7 @@ def test_a_drift_is_heard_from_messages(
     drifting: FastDaemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = drifting.arm.joint_names
-    messages = Messages(names, drifting.fast.samples(SECONDS))
+    messages = ProgramMessages(names, drifting.fast.samples(SECONDS))
     bus = ListeningBus(messages, "ros2:/joint_states", names, rate=50.0, clock=messages)
     monkeypatch.setattr(bus_open, "open_listening_bus", lambda *given: bus)
     store = ["--store", str(tmp_path / "records.db")]

@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 from gcomp.arm.inertials import inertial_of
 from gcomp.arm.load import bar_inertials
 from gcomp.external.contact import ContactDetector, threshold
-from gcomp.external.external_model import BEGINNING, ROWS_RATE, from_records, variance_components
-from gcomp.external.filtered_rows import BANDWIDTH, RowFilter, faded_sums
+from gcomp.external.external_model import BEGINNING, ROWS_RATE, factor_of_95, from_records, variance_components
+from gcomp.external.filtered_rows import BANDWIDTH, STATES, RowFilter, Samples, faded_sums
 from gcomp.external.rigid_motion import jacobian, momentum_terms, rigid_motion
 from gcomp.external.wrench import smallest_force, wrench
 from gcomp.gravity.torque import gravity_torque
@@ -75,8 +75,24 @@ def test_a_push_is_a_contact_on_its_link_with_a_lower_bound(placed, learned):
     assert off.mean() > 0.9
 
 
-def test_a_load_taken_up_is_no_contact_and_is_carried_on(placed, learned):
-    work, mass = Work(placed, 7, 40.0), 0.8
+def test_what_has_gone_was_a_push_if_it_would_still_show_were_it_a_load(placed, learned):
+    """Straight down at the hand, as a load would."""
+    work, force = Work(placed, 6, 30.0), np.array([0.3, 0.6, -3.0])
+    _, events, _ = judged(learned, work, pushed(work, placed, force, 3, 12.0, 12.7))
+    assert [event.kind for event in events] == ["contact or load", "contact"]
+    assert events[1].odds > 3.0 > events[0].odds
+
+
+@pytest.mark.parametrize("seed", [7, 11])
+def test_a_load_that_other_poses_hide_does_not_become_a_contact(placed, learned, seed):
+    work = Work(placed, seed, 40.0)
+    _, events, _ = judged(learned, work, carried(work, placed, 0.15, 15.0))
+    assert events
+    assert "contact" not in [event.kind for event in events]
+
+
+def carried(work, placed, mass, begin):
+    """Torque (K, n) with which a load from a time on pushes the joints [N·m]."""
     arm = placed.arm.arm
     links = np.zeros((arm.n, 10))
     links[-1] = inertial_of(mass, POINT, np.zeros((3, 3)))
@@ -86,8 +102,12 @@ def test_a_load_taken_up_is_no_contact_and_is_carried_on(placed, learned):
         for h in (step, -step)
     )
     torque = (after - before) / (2 * step) - momentum_terms(rigid_motion(arm, work.q, work.v), links)[1]
-    load = -torque * (work.t >= 15.0)[:, None]
-    _, events, detector = judged(learned, work, load)
+    return -torque * (work.t >= begin)[:, None]
+
+
+def test_a_load_taken_up_is_no_contact_and_is_carried_on(placed, learned):
+    work, mass = Work(placed, 7, 40.0), 0.8
+    _, events, detector = judged(learned, work, carried(work, placed, mass, 15.0))
     assert "contact" not in [event.kind for event in events]
     assert events
     assert events[-1].kind == "load"
@@ -132,6 +152,26 @@ def test_variance_components_are_those_that_the_rows_were_drawn_with():
     parts = np.column_stack([np.ones(20_000), random.uniform(0, 1, 20_000) < 0.3, random.exponential(1, 20_000)])
     square = (parts @ [0.5, 4.0, 1.0]) * random.normal(size=20_000) ** 2
     assert variance_components(parts, square) == pytest.approx([0.5, 4.0, 1.0], rel=0.15)
+
+
+def test_rows_of_one_rest_are_one_value_when_bounds_are_set():
+    random, held = np.random.default_rng(6), []
+    for _ in range(400):
+        rests = np.repeat(random.uniform(-1.0, 1.0, 30), 40) + 1e-3 * random.normal(size=1200)
+        ones = np.ones(1200)
+        held.append(min(1.96 * factor_of_95(rests, ones, 0.0 * ones), 1.0))  # as a new rest is uniform, too
+    assert 0.945 < np.mean(held) < 0.975  # of 30 values the 29th would not be enough
+
+
+def test_friction_of_a_joint_at_rest_grows_with_the_torque_it_holds(placed):
+    pose, n = np.array([0.3, -0.5, 0.8, 0.2]), placed.arm.arm.n
+    q = np.vstack([np.linspace(pose - 0.5, pose, 100), np.tile(pose, (100, 1))])
+    samples = Samples(q, np.gradient(q, 1 / RATE, axis=0), 0.0 * q, 0.0 * q)
+    state = RowFilter(placed.arm.arm, bar_inertials(placed), RATE).rows(samples).state[..., STATES.index("held")]
+    gravity = np.abs(gravity_torque(placed.arm.arm, placed.arm.beta, pose))
+    assert (state[50] < 0.1 * gravity + 1e-9).all()
+    assert state[-1] == pytest.approx(gravity, rel=1e-3)
+    assert state.shape == (200, n)
 
 
 def test_a_threshold_is_exceeded_as_often_as_it_says():

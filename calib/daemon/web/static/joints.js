@@ -69,13 +69,11 @@ export function showJoints(joints, moving = false) {
   }
 }
 
-function interval(cell, value, std, digits, off) {
+export function interval(cell, value, std, digits, off) {
   cell.classList.toggle("off", off);
   const around = std > 0 ? ` ± ${number(1.96 * std, digits)}` : ""; // 0: unchanged, because only the other one drifts
   cell.replaceChildren(signed(value, digits), make("span", { className: "pm" }, around));
 }
-
-export const showExternal = ({ reason }) => put(by("no-external"), reason && `No external torque: ${reason}.`);
 
 // Summary of the estimates in one line.
 export function verdict(estimates) {

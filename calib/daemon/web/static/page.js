@@ -5,9 +5,10 @@ import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, set
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
 import { initArm, showArm } from "./arm.js";
-import { showEstimates, showExternal, showJoints, shownScale, verdict } from "./joints.js";
+import { showEstimates, showJoints, shownScale, verdict } from "./joints.js";
 import { addSample, drawLive, fetchWindow, initLive, moves } from "./live.js";
 import { fetchProposals, showProposals } from "./proposals.js";
+import { addContact, showExternal, showWrench } from "./touch.js";
 
 const SLOW = 2000; // ms between updates of what changes slowly
 let status = null;
@@ -102,10 +103,14 @@ const on = {
     status = { ...status, state: item.state, bus: item.bus, time: item.time };
     addSample(item);
     showJoints(item.joints, moves());
+    showWrench(item);
     showArm(item.joints, shownScale(), moves());
     if (!document.hidden) drawLive();
     showBus(item.bus);
     showState(item.state, item.bus.fault || status.detail || "");
+  },
+  contact({ contact }) {
+    addContact(contact);
   },
   event({ event }) {
     addEvent(event);
@@ -115,12 +120,14 @@ const on = {
 };
 
 async function slowly() {
-  const [now, estimates] = await Promise.all([get("/api/status"), get("/api/estimates"), fetchProposals(), fetchNew()]);
+  const asked = [get("/api/status"), get("/api/estimates"), get("/api/external"), fetchProposals(), fetchNew()];
+  const [now, estimates, external] = await Promise.all(asked);
   status = now;
   summary = verdict(estimates);
   setNow(status.time);
   showStatus();
   showEstimates(estimates);
+  showExternal(external);
   setLive(estimates, status);
   drawIfChanged();
 }

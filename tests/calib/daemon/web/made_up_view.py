@@ -30,6 +30,7 @@ class MadeUpView:
         self.report = None
         self.disk_hangs = False
         self.log: list[view.EventRecord] = []
+        self.contacts: list[view.ExternalEvent] = []
         self.points: list[view.HistoryPoint] = []
         self.offered: list[view.Proposal] = []
         self.shift = 0.0
@@ -71,7 +72,27 @@ class MadeUpView:
         return NOW + timedelta(seconds=self.t)
 
     def item(self) -> view.JointsItem:
-        return view.JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
+        return view.JointsItem(
+            time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints(), wrench=self.wrench(),
+            load=0.0,
+        )  # fmt: skip
+
+    def wrench(self) -> view.ExternalWrench:
+        """Six joints do not show the moment about x."""
+        return view.ExternalWrench(
+            joint=NAMES[-1], point=(0.0, 0.0, 0.1), force=(0.4 + 40.0 * self.shift, -0.2, 1.1),
+            force_std=(0.8, 0.7, 1.2), moment=(None, 0.1, -0.05), moment_std=(None, 0.2, 0.1),
+        )  # fmt: skip
+
+    def touch(self) -> view.ExternalEvent:
+        """A contact, told at once."""
+        contact = view.ExternalEvent(
+            time=self.time(), kind="contact", joints=(NAMES[1], NAMES[0]), link=NAMES[3], probability=0.82,
+            least_force=9.4, mass=0.0,
+        )  # fmt: skip
+        self.contacts.append(contact)
+        self.hub.publish(view.ContactItem(contact=contact))
+        return contact
 
     def bus(self) -> view.BusHealth:
         if self.fault:
@@ -118,7 +139,10 @@ class MadeUpView:
     def external(self) -> view.ExternalNow:
         joints = self.joints()
         torque, bound = (tuple(getattr(joint, f"external_{name}") for joint in joints) for name in ("torque", "bound"))
-        return view.ExternalNow(reason="", age_s=0.02, baseline_s=600.0, torque=torque, bound=bound)
+        return view.ExternalNow(
+            reason="", age_s=0.02, baseline_s=600.0, torque=torque, bound=bound, wrench=self.wrench(), load=0.0,
+            events=tuple(self.contacts), counts={"contact": len(self.contacts)},
+        )  # fmt: skip
 
     def window(self, seconds: float, most: int) -> Window:
         """A swing since the start, of the torques alone if nothing `moves`."""

@@ -11,6 +11,7 @@ from armlink.loop.messages import Batch
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.stated_model import StatedModel
+from calib.daemon.view import ContactItem
 from calib.external.arm_model import ArmRecords, listener_of
 from calib.external.learned import Learned, load_learned, save_learned
 from calib.external.listening import WrenchFrame
@@ -73,6 +74,36 @@ def test_a_push_is_told_with_its_bound_and_as_an_event(taught):
     assert (shown.external_torque, shown.external_bound) == (pushed.torque[1], pushed.bound[1])
     assert pushed.wrench is not None
     taught.fast.push = None
+    logged = [each for each in taught.view.events() if each.kind == "contact" and "least_force" in each.evidence]
+    assert len(logged) == len({each.evidence["kind"] for each in logged})  # of each kind one a minute
+    assert f"{logged[-1].evidence['kind']} " in logged[-1].text
+    assert sum(pushed.counts.values()) == len(pushed.events)
+    assert {each.evidence["kind"] for each in logged} == {kind for kind, count in pushed.counts.items() if count}
+
+
+def test_a_contact_is_streamed_at_once_and_counted(taught, tmp_path):
+    taught.service.reload(taught.arm, taught.settings)
+    taught.run(30)
+    client = taught.service.hub.subscribe()
+    before = dict(taught.view.external().counts)
+    taught.fast.push = lambda q: np.where(np.arange(q.shape[1]) == 1, -PUSH, 0.0) + 0.0 * q
+    taught.run(3)
+    taught.fast.push = None
+    told = [item.contact for item in client._items if isinstance(item, ContactItem)]
+    client.close()
+    answer = taught.view.external()
+    assert told
+    assert tuple(told) == answer.events[-len(told) :]
+    assert sum(answer.counts.values()) - sum(before.values()) == len(told)
+    snapshot = taught.view.snapshot()
+    assert snapshot.wrench == answer.wrench
+    assert snapshot.load == answer.load
+    with served(lambda: taught.view, tmp_path / "api.sock") as server:
+        text = server.client().get("/metrics").text
+    for kind, count in answer.counts.items():
+        assert f'armlink_contacts_total{{kind="{kind}"}} {float(count)}' in text
+    assert 'armlink_joint_external_torque_newton_metres{joint="joint_2"}' in text
+    assert 'armlink_joint_external_bound_newton_metres{joint="joint_2"}' in text
 
 
 def test_the_route_and_the_stream_have_it(taught, tmp_path):

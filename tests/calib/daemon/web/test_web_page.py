@@ -321,3 +321,30 @@ def test_a_decision_shows_its_evidence(browser: Browser, server: Served, view: M
     assert box["x"] >= 0
     assert box["x"] + box["width"] <= 390
     page.click("#decision-no")
+
+
+def test_what_touches_the_arm(browser: Browser, server: Served, view: MadeUpView) -> None:
+    page = open_page(browser, server)
+    force, moment = (page.locator(f"[data-wrench={name}] td") for name in ("force", "moment"))
+    expect(force).to_have_text(["+0.4 ± 1.6", "−0.2 ± 1.4", "+1.1 ± 2.4"])
+    expect(moment).to_have_text(["–", "+0.1 ± 0.4", "−0.1 ± 0.2"])
+    expect(page.locator("#touch-frame")).to_have_text("at joint_7")
+    expect(page.locator("#no-contacts")).to_be_visible()
+    expect(page.locator("#link")).to_contain_text("live")
+    server.do(view.touch)
+    expect(page.locator("#contacts li")).to_have_count(1)
+    expect(page.locator("#contacts li")).to_contain_text(
+        "contact: on link joint_4 (82 %), at least 9.4 N; joints joint_2, joint_1"
+    )
+    view.shift = 1.0
+
+    def pushed() -> bool:
+        server.do(view.tick)
+        page.wait_for_timeout(20)
+        return force.first.text_content() == "+40.4 ± 1.6"
+
+    assert any(pushed() for _ in range(200))
+    expect(force.first).to_have_class(re.compile("off"))
+    page.reload()
+    expect(page.locator("#contacts li")).to_have_count(1)
+    assert page.complaints == []
