@@ -4,13 +4,14 @@ import ast
 import importlib.util
 import os
 import re
+import shutil
 import sys
 from importlib.metadata import EntryPoint, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from armlink import completion
-from armlink.content.printable_text import PrintableFormatter, printable_text
+from armlink.content.printable_text import PrintableFormatter, printable_text, wrapped
 from armlink.contributed import contributed
 from armlink.termination import terminate_as_interrupt
 
@@ -118,7 +119,7 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
     from armlink.commands.options import GroupedCommand
 
     if logging.lastResort is not None:
-        logging.lastResort.setFormatter(PrintableFormatter())
+        logging.lastResort.setFormatter(PrintableFormatter(_columns(sys.stderr)))
     target = point.load()
     if isinstance(target, typer.Typer):
         app = target
@@ -136,17 +137,33 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    sys.stderr.write(f"armlink: {printable_text(' '.join(message.split()))}\n")
+    line = f"armlink: {printable_text(' '.join(message.split()))}"
+    sys.stderr.write(f"{_in_terminal(sys.stderr, line)}\n")
     return status
+
+
+def _columns(stream: TextIO) -> int | None:
+    """Columns of a terminal; None for a pipe or a file."""
+    return shutil.get_terminal_size().columns if stream.isatty() else None
+
+
+def _in_terminal(stream: TextIO, line: str, indent: int = 0) -> str:
+    """The line as it is shown on `stream`: broken between words where that is a terminal, then with an indent."""
+    columns = _columns(stream)
+    return line if columns is None else wrapped(line, columns - indent).replace("\n", "\n" + " " * indent)
 
 
 def _help(points: dict[str, EntryPoint]) -> str:
     width = max(map(len, points), default=0)
-    rows = "\n".join(f"  {name:<{width}}  {_summary(points[name])}" for name in sorted(points))
+    rows = "\n".join(
+        f"  {name:<{width}}  {_in_terminal(sys.stdout, _summary(points[name]), width + 4)}" for name in sorted(points)
+    )
+    completed = "armlink completion bash|zsh|fish prints the script for completion in the shell."
     return (
-        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\nOptions:\n  --help     Shows this, and "
-        f"armlink COMMAND --help says more.\n  --version  Shows the version, {version('armlink')}.\n\narmlink "
-        "completion bash|zsh|fish prints the script for completion in the shell.\n\nExample: armlink demo --seed 1\n"
+        f"Usage: armlink COMMAND [OPTIONS]\n\n{_in_terminal(sys.stdout, PURPOSE)}\n\nCommands:\n{rows}\n\nOptions:\n"
+        f"  --help     Shows this, and armlink COMMAND --help says more.\n"
+        f"  --version  Shows the version, {version('armlink')}.\n\n"
+        f"{_in_terminal(sys.stdout, completed)}\n\nExample: armlink demo --seed 1\n"
     )
 
 

@@ -24,7 +24,7 @@ PACKAGE = "package://"
 POINTER = b"version https://git-lfs"
 """Beginning of what Git leaves in place of a large file that was not fetched."""
 NOT_FOUND, UNFETCHED = "not found", "not fetched (git lfs pull)"
-UNREAD, FLAT = "not binary STL, OBJ or MSH, which MuJoCo reads", "without volume"
+UNREAD, FLAT = "in a form that MuJoCo does not read (it reads binary STL, OBJ and MSH)", "without volume"
 """Why a mesh is of no use."""
 FLATNESS = 1e-7
 """Thickness of a mesh over its size below which MuJoCo finds no volume, as STL's single precision has it."""
@@ -74,6 +74,12 @@ class ModelFile:
             f"{len(files)} {'mesh' if len(files) == 1 else 'meshes'} {reason}, such as {files[0]}"
             for reason, files in by_reason.items()
         )
+
+    def unphysical_beyond(self, joint: str) -> tuple[str, ...]:
+        """The `unphysical` bodies that this joint moves: the inertia of what rests has no effect."""
+        first = next((each.parent for each in self.spec.joints if each.name == joint), None)
+        moved = set() if first is None else {first.name, *(each.name for each in first.find_all("body"))}
+        return tuple(name for name in self.unphysical if name in moved)
 
     @property
     def shapes(self) -> int:

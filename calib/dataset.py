@@ -222,12 +222,35 @@ def _loaded(path: Path) -> SweepData:
     return SweepData(path, manifest, tuple(readings), plan, resolution, digest, tuple(stalls))
 
 
+def earlier_passes(data: SweepData) -> list[SweepData]:
+    """Whole data sets of the same arm and drives that were begun before this one, beside it or in the present folder;
+    the oldest first."""
+    ours, found = data.manifest, dict[Path, SweepData]()
+    for file in (*data.path.parent.glob(f"*/{MANIFEST}"), *Path().glob(f"*/{MANIFEST}")):
+        path = file.parent
+        try:
+            theirs = _read_manifest(path)
+            same = all(getattr(theirs, key) == getattr(ours, key) for key in ("arm", "serial", "description_hash"))
+            if same and theirs.drives == ours.drives and theirs.created <= ours.created:
+                found.setdefault(path.resolve(), load_data(path))
+        except BadInput:  # of another version, or not a data set at all
+            continue
+    found.pop(data.path.resolve(), None)
+    return sorted((each for each in found.values() if each.complete), key=lambda each: each.manifest.created)
+
+
 def require_vacant(path: Path, resume: bool = False) -> None:
     """Raise BadInput unless a new data set can begin at `path` or, with `resume`, one there can be continued."""
     if resume:
         _read_manifest(path)
     elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
         raise BadInput(f"{path} is not empty: choose another directory, or continue the sweep there with `--resume`")
+
+
+def new_folder(path: Path) -> Path:
+    """The path, or one beside it with a number, at which a data set can begin."""
+    names = (path, *(path.with_name(f"{path.name}-{number}") for number in range(2, 1000)))
+    return next((each for each in names if not each.exists()), path)
 
 
 class DataWriter:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SCHEMA = "armlink.check/1"
 HOST_SCHEMA = "armlink.check-host/1"
 SCALES_SCHEMA = "armlink.check-scales/1"
+NOT_MADE = "not made"
 
 
 def check(
@@ -105,7 +106,8 @@ def check(
             f"{first.found}"
         )
     passed = sum(each.outcome == "passed" for each in found)
-    out.print(f"all {passed} checks passed; {'the joints were not enabled' if passive else joints_left(described)}")
+    left = "the joints were not enabled" if passive else joints_left(described)
+    out.print(f"all {passed} checks passed (a row of the table may stand for several checks of each joint); {left}")
     step = ["check", arm] if passive else ["sweep", arm, "--plan"] if described.has_geometry else ["doctor", arm]
     suggest(command_line(*step, bus=bus))
     return 0
@@ -266,7 +268,7 @@ def _outcomes(joints: "dict[str, list[Result]]") -> "Text":
     told = [*dict.fromkeys(words.values())]
     rows = [(each, ", ".join(name for name in words if words[name] == each)) for each in told]
     text = rows[0][0] if len(rows) == 1 else "; ".join(f"{each}: {who}" for each, who in rows)
-    return Text(text, "red" if "FAILED" in told else "green" if told != ["–"] else "")
+    return Text(text, "red" if "FAILED" in told else "green" if told != [NOT_MADE] else "")
 
 
 def _outcome(results: "list[Result]") -> float | str:
@@ -276,4 +278,4 @@ def _outcome(results: "list[Result]") -> float | str:
         return "FAILED"
     if times := [each.seconds for each in results if each.seconds is not None]:
         return max(times)
-    return "ok" if "passed" in outcomes else "–"
+    return "ok" if "passed" in outcomes else NOT_MADE

@@ -22,17 +22,20 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armlink.commands.fitted_table import fitted
-from armlink.content.printable_text import printable_text
+from armlink.content.printable_text import printable_text, wrapped
 from armlink.errors import Declined
 
 PIPE_WIDTH = 10_000
 """Columns of a pipe or file: no line is broken there, unless the environment says COLUMNS."""
+ANSWER_WIDTH = 16
+"""Columns of a terminal for what stands behind a question."""
 _on_screen: list[Live] = []
 """Spinners and progress bars that are shown now, on any console."""
 
 
 class PlainConsole(Console):
-    """Sentences come as they are and unbroken, so that a command in one can be pasted; tables fit the width.
+    """Sentences are broken between words on a terminal and unbroken elsewhere; a command stays whole, so that it can be
+    pasted; tables fit the width.
 
     A console of this class never writes into a spinner or a progress bar of another one.
     """
@@ -54,8 +57,15 @@ class PlainConsole(Console):
             _on_screen.pop()
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As rich has it; above a spinner or progress bar that is shown on the same terminal."""
-        if all(isinstance(each, str) for each in objects):
+        """As rich has it; above a spinner or progress bar that is shown on the same terminal.
+
+        A sentence with `soft_wrap` is not broken.
+        """
+        if objects and all(isinstance(each, str | Text) for each in objects):
+            if self.is_terminal and not options.get("soft_wrap"):
+                sentence = Text(" ").join(_plain(each) for each in objects)
+                sentence.plain = wrapped(sentence.plain, self.width)
+                objects = (sentence,)
             options = {"highlight": False, "soft_wrap": True} | options
         shown = _on_screen[-1].console if _on_screen else self
         if shown is not self and shown.is_terminal and self.is_terminal:
@@ -111,13 +121,13 @@ def command_line(*words: str, **options: object) -> str:
 
 
 def suggest(command: str) -> None:
-    PlainConsole().print(f"next: {command}", style="bold")
+    PlainConsole().print(f"next: {command}", style="bold", soft_wrap=True)
 
 
 def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool:
     """The answer to a question of yes or no; raises Declined where it is no and `abort`."""
     with _question():
-        agreed = typer.confirm(printable_text(question), default=default, err=True)
+        agreed = typer.confirm(_wrapped_question(question), default=default, err=True)
     if abort and not agreed:
         raise Declined("the answer was no: nothing was done")
     return agreed
@@ -126,7 +136,13 @@ def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool
 def ask(question: str, **options: Any) -> Any:
     """The answer to a question; `options` as of `typer.prompt`."""
     with _question():
-        return typer.prompt(printable_text(question), err=True, **options)
+        return typer.prompt(_wrapped_question(question), err=True, **options)
+
+
+def _wrapped_question(question: str) -> str:
+    """With room for ` [y/N]: ` and the first letters of an answer behind it."""
+    console, text = PlainConsole(), printable_text(question)
+    return wrapped(text, console.width - ANSWER_WIDTH) if console.is_terminal else text
 
 
 @contextlib.contextmanager

@@ -7,8 +7,12 @@ Cf, Cs, Co, Cn, Zl, Zp, and spaces other than U+0020).
 
 import json
 import logging
+import re
 import unicodedata
 from typing import Any
+
+_UNITS = re.compile(r" *(?:`[^`]*`|[^ ])+| +$")
+"""Parts of a line that are not broken, each with the spaces before it; a lone backtick is a letter as any other."""
 
 
 def printable_text(text: str, keep: str = "") -> str:
@@ -22,6 +26,22 @@ def printable_text(text: str, keep: str = "") -> str:
     return "".join(escaped)
 
 
+def wrapped(text: str, width: int) -> str:
+    """A line in lines of at most `width` columns, broken between words only: some spaces become line breaks.
+
+    A command in backticks, a path and anything else without a space stays whole where a line cannot hold it.
+    """
+    lines = [""]
+    for unit in _UNITS.findall(text):
+        word = unit.lstrip(" ")
+        if word and lines != [""] and len(lines[-1]) + len(unit) > width:
+            lines[-1] += unit[: -len(word) - 1]
+            lines.append(word)
+        else:
+            lines[-1] += unit
+    return "\n".join(lines)
+
+
 def printable_json(value: Any, **options: Any) -> str:
     """`json.dumps` with letters as they are, and escapes of JSON for what is not printable."""
     text = json.dumps(value, ensure_ascii=False, **options)
@@ -31,11 +51,18 @@ def printable_json(value: Any, **options: Any) -> str:
 
 
 class PrintableFormatter(logging.Formatter):
-    """Lines of a log that go to a terminal."""
+    """Lines of a log that go to a terminal of so many columns; None: to something else."""
+
+    def __init__(self, width: int | None = None) -> None:
+        super().__init__()
+        self._width = width
 
     def format(self, record: logging.LogRecord) -> str:
         """As logging has it; lines of a traceback stay lines."""
-        return printable_text(super().format(record), keep="\n" if record.exc_info else "")
+        if record.exc_info:
+            return printable_text(super().format(record), keep="\n")
+        text = printable_text(super().format(record))
+        return text if self._width is None else wrapped(text, self._width)
 
 
 def _is_harmless(character: str) -> bool:

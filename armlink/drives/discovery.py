@@ -70,20 +70,22 @@ class BusDrives:
         found = {name: family(name).discovery for name in family_names() if not family(name).traits.heard}
         ways = {name: way for name, way in found.items() if way is not None}
         self.parts: list[FoundDrives] = []
-        asked, others = list[str](), [f"{name} (found only by the ids in an arm file)" for name in found.keys() - ways]
+        asked = list[str]()
+        lacking = {"found only by the ids in an arm file": sorted(found.keys() - ways)}
         order = TopologicalSorter({name: way.spares for name, way in ways.items()}).static_order()
         for name in filter(ways.__contains__, order):
             way, lack = ways[name], ""
             if family(name).traits.frame == "fd" and not searched.fd:
                 lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
             if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
-                lack = f"its requests could command the {beside.pop()} drives, or be taken for their frames"
+                lack = f"requests to them could command the {beside.pop()} drives, or be taken for their frames"
             if lack:
-                others.append(f"{name} ({lack})")
+                lacking.setdefault(lack, []).append(name)
                 continue
             asked.append(name)
             part = way.find(searched)
             self.parts.append(AskedDrives(searched, part) if isinstance(part, Sequence) else part)
+        others = [f"{', '.join(names)} ({lack})" for lack, names in lacking.items() if names]
         self.told = f"looked for {', '.join(sorted(asked))}" + (f"; not for {', '.join(others)}" if others else "")
         self._channel = searched.channel_info
 

@@ -45,6 +45,8 @@ class Monitor(HeardArm):
         self.listen_on(self._open_port(bus), self._count)
         self._places = PlaceWatch(arm, self.values, tell=lambda text: None)  # `describe` does
         self._syncs = 0
+        self._counted: tuple[float, int, int] | None = None
+        """Time [s], cycles and bits at the end of the last view."""
         if sync:
             silent = [group.family.name for group in self.groups if not group.drives.poll(first=False)]
             if silent:
@@ -76,10 +78,14 @@ class Monitor(HeardArm):
 
     def watch(self, seconds: float) -> View:
         """Listen for `seconds`; raises BusFault if the bus fails."""
-        start, syncs, bits = self.clock.now(), self._syncs, self._loop.bits
+        if self._counted is None:
+            while self._loop.receive(0.0):  # what waited since the bus was opened came in another time than this
+                pass
+        start, syncs, bits = self._counted or (self.clock.now(), self._syncs, self._loop.bits)
         sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
         sample.position = self._places.take(sample.position)
-        elapsed = self.clock.now() - start
+        self._counted = (self.clock.now(), self._syncs, self._loop.bits)
+        elapsed = self._counted[0] - start
         rate = (self._syncs - syncs) / elapsed
         return View(sample, rate, (self._loop.bits - bits) / (self.section.bus.bitrate * elapsed))
 

@@ -48,7 +48,7 @@ def hold_afloat(
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
     if not yes:
-        confirm(f"{arm_file.name} will be held by its gravity model alone. Do you hold it with your hand?")
+        confirm(f"{arm_file.name} will be held by its gravity model alone", "Do you hold it with your hand?")
     resume = command_line("float", arm, bus=bus, record=record, tool=tool, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()

@@ -16,13 +16,14 @@ from armlink.commands.plain_console import PlainColumn, PlainConsole
 from armlink.commands.plain_console import confirm as ask_to_confirm
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
-from calib.plan.types import SweepPlan
+from calib.plan.types import SCOUT, SCOUT_TITLE, SweepPlan, reading_name
 from calib.report.tables import interval_table
 
 if TYPE_CHECKING:
     from calib.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
+SPACE_CLEAR = "Is its space clear?"
 _CONSOLE = PlainConsole()
 """For progress and warnings."""
 
@@ -37,7 +38,7 @@ class SweepScreen:
             _CONSOLE.print(title)
         columns = (
             PlainColumn("{task.description}"),
-            BarColumn(bar_width=min(40, _CONSOLE.width // 5)),
+            BarColumn(bar_width=min(40, _CONSOLE.width // 8)),
             PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
             PlainColumn("{task.fields[text]}"),
         )
@@ -92,10 +93,15 @@ class SweepScreen:
         self._progress.stop()
 
 
-def confirm(question: str) -> None:
-    """Ask a person at the terminal; without a terminal nobody is asked. Raises Declined where the answer is no."""
+def confirm(motion: str, question: str) -> None:
+    """Say what will move and ask a person at the terminal; raises Declined where the answer is no.
+
+    Without a terminal nobody is asked, and a line says so.
+    """
     if sys.stdin is not None and sys.stdin.isatty():
-        ask_to_confirm(question)
+        ask_to_confirm(f"{motion}. {question}")
+    else:
+        _CONSOLE.print(f"{motion}. {question} Without a terminal nobody is asked, and it moves now")
 
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
@@ -114,7 +120,7 @@ def print_preflight(found: "Preflight", console: PlainConsole) -> None:
 
 def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
-    title, short = f"{arm.name}: {len(plan.sweeps)} sweeps", _short(arm.joint_names)
+    title, short = f"{arm.name}: {len(plan.sweeps)} sweeps", _short(arm.joint_names, console.width // 2)
     table = Table(
         Column("sweep", overflow="fold"), "from … to", "Γ/g", *short, title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
@@ -150,7 +156,10 @@ def unsettled_lines(data: "SweepData") -> list[str]:
     """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
     if not data.unsettled:
         return []
-    places = list(dict.fromkeys(reading.sweep for reading in data.unsettled))
+    places = [
+        f"the {SCOUT_TITLE}" if sweep == SCOUT else sweep
+        for sweep in dict.fromkeys(reading.sweep for reading in data.unsettled)
+    ]
     return [
         (
             f"{len(data.unsettled)} of {len(data.readings)} readings had not settled when their time was up, in "
@@ -163,8 +172,14 @@ def stall_lines(data: "SweepData") -> list[str]:
     """In one line, how often the joints had to be stopped; nothing if they never were."""
     if not data.stalls:
         return []
-    places = list(dict.fromkeys(stall.reading for stall in data.stalls))
+    places = list(dict.fromkeys(_place(stall.reading) for stall in data.stalls))
     return [f"the joints were stopped {len(data.stalls)} times, and these readings were repeated: {', '.join(places)}"]
+
+
+def _place(reading: str) -> str:
+    """The place in the note of a stall, for people: `scout 6`, `elbow.1 3`, or a whole sweep."""
+    sweep, _, number = reading.rpartition(" ")
+    return reading_name(sweep, int(number) - 1) if number.isdigit() else reading
 
 
 def warn_late(arm: ArmFile, lateness: Lateness) -> None:
@@ -173,11 +188,13 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     print_lines([warning] if warning else [], "yellow")
 
 
-def _short(names: tuple[str, ...]) -> list[str]:
-    """The numbers of names such as joint_1, joint_2; other names as they are."""
+def _short(names: tuple[str, ...], width: int) -> list[str]:
+    """The numbers of names such as joint_1, joint_2; other names where they fit, else numbers from the base."""
     begin = names[0].rstrip("0123456789")
     short = [name.removeprefix(begin) for name in names]
-    return short if all(short) else list(names)
+    if all(each.isdigit() for each in short):
+        return short
+    return list(names) if len(" ".join(names)) <= width else [str(number) for number in range(1, len(names) + 1)]
 
 
 def print_intervals(

@@ -65,7 +65,7 @@ def sweep(
 
     Example: armlink sweep sarcos --bus socketcan:vcan0 --out unloaded
     """
-    from armlink.arm_file import load_arm
+    from armlink.arm_file import SIMULATED, load_arm
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
@@ -73,9 +73,9 @@ def sweep(
     from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SweepScreen, confirm, warn_late
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, warn_late
     from calib.commissioning.model_checks import refuse_impossible_sweep
-    from calib.dataset import MANIFEST, require_vacant
+    from calib.dataset import MANIFEST, new_folder, require_vacant
 
     if picture is not None:
         require_extra("--picture", "reports")
@@ -83,11 +83,12 @@ def sweep(
     refuse_impossible_sweep(arm_file, reference_mass)
     if plan:
         write_json(json_file, _plan(arm_file, seed, reference_mass, picture, results(json_file)))
-        folder = "loaded" if reference_mass else "unloaded"
+        folder = new_folder(Path("loaded" if reference_mass else "unloaded"))
         suggest(
             command_line(
                 "sweep",
                 arm,
+                *["--dry-run"] * (bus is None and arm_file.require_link().bus.interface == SIMULATED),
                 out=folder,
                 reference_mass=f"{reference_mass:g}" if reference_mass else None,
                 bus=bus,
@@ -99,10 +100,7 @@ def sweep(
         raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")
     require_vacant(out, resume)
     if not dry_run and not yes:
-        confirm(
-            f"{arm_file.name} will move through its whole range, with {reference_mass:g} kg attached. Is its "
-            "space clear?"
-        )
+        confirm(f"{arm_file.name} will move through its whole range, {_load(reference_mass)}", SPACE_CLEAR)
     load = reference_mass if dry_run else 0.0
 
     def going_on() -> str:
@@ -113,7 +111,7 @@ def sweep(
     with early_end(arm_file, going_on) as work, opened as link:
         link.start()
         work.enabled = True
-        with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
+        with SweepScreen(f"{arm_file.name}, {_load(reference_mass)}") as screen:
             found, data = _run(
                 link,
                 arm_file,
@@ -135,7 +133,7 @@ def _plan(
     arm_file: "ArmFile", seed: int, reference_mass: float, picture: Path | None, console: "PlainConsole"
 ) -> dict[str, Any]:
     """Print and check the plan, and draw it if asked to; the answer for machines."""
-    from calib.arm.sweep_section import sweep_motion
+    from calib.arm.sweep_section import sweep_motion, sweep_section
     from calib.commands.screen import print_plan
     from calib.plan.collisions import check_plan
     from calib.plan.creep_plan import creep_seconds, plan_creep
@@ -154,12 +152,18 @@ def _plan(
         took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
         before = f"{_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
+        if sweep_section(arm_file).hold == "servo":
+            before += " (`--no-check-stops` leaves this out, as for a joint without stops)"
         told = f"about {_minutes(took)} for each pass, {before}; {checked}{drawn}"
     print_plan(arm_file, planned, console)
     if picture is not None:
         draw_plan(arm_file, planned, picture)
     console.print(told)
     return {**planned.model_dump(mode="json"), **answer}
+
+
+def _load(reference_mass: float) -> str:
+    return f"with {reference_mass:g} kg attached" if reference_mass else "without a load"
 
 
 def _minutes(seconds: float) -> str:
@@ -222,20 +226,34 @@ def _show(
     print_plan(arm_file, data.plan, console)
     print_lines([*unsettled_lines(data), *stall_lines(data)], "yellow", console)
     complete = f"{data.path} is complete with {len(data.readings)} readings"
-    if not data.manifest.reference_mass:
-        mass = data.plan.reference_mass
-        loaded = data.path.with_name(f"{data.path.name}-loaded")
-        console.print(f"{complete}; now attach {mass:g} kg and sweep again")
-        suggest(command_line(*again, reference_mass=f"{mass:g}", out=loaded))
-    elif data.creeps:
-        bare = data.path.with_name(f"{data.path.name}-again")
-        console.print(f"{complete}; now take the mass off and sweep once more without it")
-        suggest(command_line(*again, out=bare))
-    else:
-        bare = data.path.with_name(data.path.name.removesuffix("-loaded"))
-        unloaded = bare if bare != data.path else data.path.with_name("unloaded")
-        console.print(f"{complete}; now fit both passes")
-        suggest(command_line("calibrate", str(unloaded), str(data.path)))
+    told, step = next_step(data, again)
+    console.print(f"{complete}; {told}")
+    suggest(command_line(*step))
+
+
+def next_step(data: "SweepData", again: list[str]) -> tuple[str, list[str]]:
+    """The next step after this pass, in a sentence and in words of a command; `again` is that of another pass."""
+    from calib.dataset import earlier_passes, new_folder
+
+    assert data.plan is not None
+    before = [each for each in earlier_passes(data) if each.creeps == data.creeps]
+    bare = [each.path for each in before if not each.manifest.reference_mass]
+
+    def another(name: str, *mass: str) -> list[str]:
+        return [*again, *mass, "--out", str(new_folder(data.path.with_name(name)))]
+
+    if data.manifest.reference_mass and not bare:
+        return "now take the mass off and sweep without it", another("unloaded")
+    if data.manifest.reference_mass and data.creeps:
+        return "now take the mass off and sweep once more without it", another(f"{bare[-1].name}-again")
+    if data.manifest.reference_mass:
+        return "now fit both passes", ["calibrate", str(bare[-1]), str(data.path)]
+    if data.creeps and bare and before[-1].manifest.reference_mass:
+        return "now fit the three passes", ["calibrate", str(bare[-1]), str(before[-1].path), str(data.path)]
+    mass = f"{data.plan.reference_mass:g}"
+    name = data.path.name
+    name = name.replace("unloaded", "loaded") if "unloaded" in name else f"{name}-loaded"
+    return f"now attach {mass} kg and sweep again", another(name, "--reference-mass", mass)
 
 
 def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:

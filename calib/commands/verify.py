@@ -43,7 +43,7 @@ def verify(
     from armlink.loop.open import open_arm
     from calib.arm.sweep_section import sweep_motion
     from calib.arm.tool import with_tool
-    from calib.commands.screen import SweepScreen, confirm
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
@@ -51,7 +51,7 @@ def verify(
         require_extra("--report", "reports")
     arm_file = with_tool(load_arm(arm), tool)
     if not yes:
-        confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is its space clear?")
+        confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR)
     with (
         early_end(arm_file, command_line("verify", arm, bus=bus, tool=tool, store=store)) as work,
         open_arm(arm_file, bus) as link,

@@ -232,7 +232,7 @@ def _chain(joints: Sequence[ModelJoint], way: list[int], path: Path, base: str |
                 f"{path}: joint {number} of the chain (body {joint.body!r}) has no name: name this joint in the model"
             )
     others = [joint for place, joint in enumerate(joints) if place not in way]
-    aside = tuple((joint.name, _aside(joint) or "is not on the chain") for joint in others)
+    aside = tuple((joint.name, _aside(joint) or "is off the chain to the tip") for joint in others)
     if aside and not chain[-1].body:
         raise BadInput(
             f"{path}: the body of joint {chain[-1].name} has no name: name this body, so that the chain can end there"

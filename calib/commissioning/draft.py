@@ -127,7 +127,7 @@ def narrow(draft: Draft, found: ClearRange) -> None:
     for joint, low, high in zip(draft.joints, found.lower, found.upper, strict=True):
         joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
         joint.notes = [note.replace("to be the limits", "to lie within the limits") for note in joint.notes]
-    draft.servo = f"the range under kinematics.stops is narrower than the model's limits: {found.reason}"
+    draft.servo = f"the range under kinematics.stops is narrower than the model's limits ({found.reason})"
 
 
 @dataclass(frozen=True)

@@ -183,12 +183,13 @@ def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     assert arm_file.model_path is not None
     where = str(arm_file.model_path)
     model = read_model(arm_file.model_path)
-    if model.unphysical:
+    unphysical = model.unphysical_beyond(arm_file.joint_names[0])
+    if unphysical:
         yield SetupFinding(
             "warning",
-            f"these inertias have a negative principal moment and are ignored: {', '.join(model.unphysical)}",
+            f"the inertia of {', '.join(unphysical)} has a negative principal moment and is ignored",
             where,
-            "correct the inertia of these links: until then their torque under acceleration is not modelled",
+            "correct it: until then the torque under acceleration of this link is not modelled",
         )
     if model.left_out:
         reasons = {reason for _, reason in model.unused_meshes}

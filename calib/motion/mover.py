@@ -341,7 +341,8 @@ class Mover:
         if abs(found - limit) > STOP_TOLERANCE + 0.025 * abs(limit):
             raise Refused(
                 f"{self.link.names[joint]} was blocked at {found:.3f} rad, but its stop should be at "
-                f"{limit:.3f} rad: is something in the way, or is the range in the arm file wrong?"
+                f"{limit:.3f} rad: is something in the way, or is the range in the arm file wrong? If this "
+                "joint has no stop, sweep with `--hold servo --no-check-stops`"
             )
         self.contacts[joint, side] = found
 

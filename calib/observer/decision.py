@@ -102,7 +102,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     if cause != "offset" and (weak_lever or covariance[0, 0] > gain_std**2):
         std = (
             f"the gain is known only to ± {np.sqrt(covariance[0, 0]):.2%}, but ± {gain_std:.2%} is required: "
-            "sweep this joint"
+            "more poses are needed in which gravity loads this joint"
         )
         if test.loss(joint, "offset", cause, beside) < VERY_STRONG_EVIDENCE:
             cause = "offset"  # explained as well without the gain, which keeps its value

@@ -264,7 +264,9 @@ class Observer:
         if state.repeated < PATIENCE:
             return []
         state.clear()
-        return self._undecided(t, None, "the arm stood in too few different poses to find a cause: sweep, or move more")
+        return self._undecided(
+            t, None, "the arm stood in too few different poses to find a cause: more poses are needed"
+        )
 
     def _undecided(self, t: float, joint: int | None, *reasons: str) -> list[Event]:
         """The reasons why nothing is proposed, reported when they change."""

@@ -115,7 +115,10 @@ def recalibrated_record(
     """
     joint = record.joints[finding.joint]
     if joint.offset is None or (joint.gain is None and finding.cause != "offset"):
-        raise Refused(f"{joint.name}: record {record.id} has no torque gain and offset to recalibrate: sweep first")
+        raise Refused(
+            f"{joint.name}: record {record.id} has no torque gain and offset to recalibrate: both come from a "
+            "calibration by sweeps"
+        )
     installed = joint.torque_calibration(TorqueCalibration(installed_gain, joint.offset))
     new = installed.compose(finding.change)
     values = {"gain": None if joint.gain is None else new.gain, "offset": new.offset}

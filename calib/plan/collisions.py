@@ -10,7 +10,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.model_file import Beside, compile_model, read_model
 from calib.arm.sweep_section import ParkedArm, sweep_section
-from calib.plan.types import Sweep, SweepPlan
+from calib.plan.types import SCOUT_TITLE, Sweep, SweepPlan
 from gcomp.arrays import Array, Mask
 
 POINTS = 15
@@ -162,7 +162,7 @@ def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:
     here = None
     for number, scouted in enumerate(plan.scout, start=1):
         goal = np.array(scouted)
-        yield from _between(here, goal, f"on the way to scout pose {number}")
+        yield from _between(here, goal, f"on the way to pose {number} of the {SCOUT_TITLE}")
         here = goal
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)

@@ -13,7 +13,7 @@ from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
 from calib.plan.collisions import sweep_ends
-from calib.plan.types import SweepPlan
+from calib.plan.types import SCOUT_TITLE, SweepPlan
 from gcomp.arm.arm import Arm, bar_frames
 from gcomp.arrays import Array
 
@@ -91,7 +91,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         y=scouted[:, 1],
         z=scouted[:, 2],
         mode="markers",
-        name="scout (tip)",
+        name=f"{SCOUT_TITLE} (tip)",
         marker={"size": 4, "color": "black"},
     )
     down = kinematics.gravity / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)

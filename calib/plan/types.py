@@ -7,6 +7,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 Side = Literal[-1, 0, 1]
 APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
+SCOUT = "scout"
+"""Name in data sets of the readings at a few poses, under position control, before the first sweep."""
+SCOUT_TITLE = "rough gravity model"
+"""Their name for people: their purpose."""
+
+
+def reading_name(sweep: str, index: int) -> str:
+    """A reading for people: its sweep, or the rough gravity model, and its number."""
+    return f"{SCOUT_TITLE}, pose {index + 1}" if sweep == SCOUT else f"{sweep}, reading {index + 1}"
 
 
 class _PlanPart(BaseModel):

@@ -282,10 +282,13 @@ def no_record(arm: ArmFile, kind: str) -> Refused:
     return Refused(f"{arm.name} {arm.serial}: there is no {kind} record yet: {way_to(arm, kind)}")
 
 
-def way_to(arm: ArmFile, *kinds: str) -> str:
-    """The commands that make records of these kinds, from the first."""
+def way_to(arm: ArmFile, *kinds: str, listen_only: bool = False) -> str:
+    """The commands that make records of these kinds, from the first; where this program only listens, who may."""
     made = " and ".join(MAKERS[kind] for kind in kinds)
-    return f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"
+    way = f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"
+    if listen_only:
+        return f"name the store that has them with `--store`, or stop the program that commands the arm, {way}"
+    return way
 
 
 def calibrations_in_force(arm: ArmFile) -> tuple[Calibration | None, ...]:

@@ -17,7 +17,7 @@ from calib.plan.collisions import check_plan
 from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.sweep_plan import plan_sweep
-from calib.plan.types import APPROACH, Sweep, SweepPlan
+from calib.plan.types import APPROACH, SCOUT, Sweep, SweepPlan, reading_name
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array
 
@@ -25,7 +25,6 @@ SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""
 SLOWER, SLOWEST = 0.4, 0.15
 """Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
-SCOUT = "scout"
 
 
 def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[StaticReading], None]) -> None:
@@ -109,7 +108,7 @@ class StepPass(SweepPass):
     def _save(self, reading: StaticReading) -> None:
         self.writer.append(reading)
         self.readings.append(reading)
-        joint, name = reading.joint, f"{reading.sweep} {reading.index + 1}"
+        joint, name = reading.joint, reading_name(reading.sweep, reading.index)
         curve = [] if joint is None else [each.torque[joint] for each in self.readings if each.sweep == reading.sweep]
         self.tell(len(self.readings), self.total, len(self.data.readings), name, curve)
 

@@ -30,7 +30,7 @@ class Account:
 
     def say(self, text: str, style: str = "", console: PlainConsole | None = None) -> None:
         line = Text.assemble((f"{time.monotonic() - self.began:5.0f} s", "dim"), "  ", (printable_text(text), style))
-        (console or self._console).print(line, soft_wrap=True)
+        (console or self._console).print(line)
 
     @contextmanager
     def stage(self, headline: str) -> Iterator[SweepScreen]:

@@ -29,6 +29,7 @@ from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
 from calib.commissioning.draft import assumed_lines
 from calib.commissioning.model_checks import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
+from calib.daemon.state.events import describe
 from calib.dataset import SweepData
 from calib.fit.creep_fit import CreepFit
 from calib.install.journaled_write import install
@@ -146,6 +147,12 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+def last_word(history: WatchHistory, after: float) -> str:
+    """The observer's last event from `after` on, in words: why it changed nothing."""
+    said = [describe(event)[1] for event in history.events if event.t >= after]
+    return said[-1] if said else "the observer saw no change"
 
 
 class Demo:
@@ -283,7 +290,10 @@ class Demo:
             half = [1.96 * float(made[-1][1].std(of)[joint]) for of in ("gain", "offset")]
             inside = "inside" if np.all(np.abs(after) <= half) else "outside"
             error += f", {inside} its 95 % interval of ±{half[0]:.2%} and ±{half[1]:.2g} N·m"
-        right = "not recalibrated" if written is None else f"recalibrated automatically after {written:.0f} s of work"
+        if written is None:
+            right = f"not recalibrated in {WORK_SECONDS:.0f} s of work ({last_word(history, began)})"
+        else:
+            right = f"recalibrated automatically after {written:.0f} s of work"
         account.find(f"{drifted}, {right}; {error}")
         truth = np.repeat([(1.0, 0.0), (1.0 + before[0], before[1]), (1.0 + after[0], after[1])], 2, axis=0).T
         marks = [(began, f"drifts, {seen}"), *([] if written is None else [(ended, "recalibrated")])]

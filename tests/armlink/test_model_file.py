@@ -3,6 +3,7 @@
 import struct
 import sys
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,12 +68,19 @@ def test_an_inertia_with_a_negative_moment_is_negligible_and_said(tmp_path):
     assert read_model(urdf(tmp_path)).unphysical == ()
 
 
+def test_the_inertia_of_a_body_that_the_arm_does_not_move_is_no_concern(tmp_path):
+    found = read_model(urdf(tmp_path, ixy=0.09))
+    assert found.unphysical_beyond("j1") == ("l1",)
+    assert replace(found, unphysical=("base",)).unphysical_beyond("j1") == ()
+
+
 def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
     path = urdf(tmp_path)
     (tmp_path / "l1.stl").write_text("solid l1\nendsolid l1\n")
     found = read_model(path)
     assert [file for file, _ in found.unused_meshes] == ["l1.stl"]
-    assert found.left_out == "1 mesh not binary STL, OBJ or MSH, which MuJoCo reads, such as l1.stl"
+    unread = "in a form that MuJoCo does not read (it reads binary STL, OBJ and MSH)"
+    assert found.left_out == f"1 mesh {unread}, such as l1.stl"
     assert compile_model(path).ngeom == 0
 
 
@@ -104,7 +112,7 @@ def test_a_mesh_of_no_use_costs_its_shape_alone(tmp_path, suffix, content, reaso
     path.write_text(path.read_text().replace("l1.stl", f"l1.{suffix}"))
     (tmp_path / f"l1.{suffix}").write_text(content)
     if suffix == "stl" and content != POINTER:
-        reason = "not binary STL, OBJ or MSH, which MuJoCo reads"
+        reason = "in a form that MuJoCo does not read (it reads binary STL, OBJ and MSH)"
     assert read_model(path).unused_meshes == ((f"l1.{suffix}", reason),)
     assert compile_model(path).ngeom == 0
 

@@ -136,11 +136,11 @@ def on_terminal(command, question, answer, stdout=None, columns=60):
     text = read_until(master, question)
     time.sleep(0.6)
     os.write(master, f"{answer}\n".encode())
-    waiting = read_until(master, answer)
-    rest = read_until(master, None)
+    waiting, _, begun = read_until(master, answer).partition(answer)
+    rest = begun + read_until(master, None)
     os.close(master)
     assert process.wait(timeout=60) == 0, text + waiting + rest
-    return text, waiting.partition(answer)[0], rest
+    return text, waiting, rest
 
 
 def read_until(master, words):

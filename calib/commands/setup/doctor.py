@@ -23,9 +23,12 @@ def doctor(
 
     Example: armlink doctor sarcos --json -
     """
+    from rich.text import Text
+
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
+    from armlink.content.printable_text import printable_text
     from armlink.loop.open import first_check
     from calib.commissioning.doctor import examine
 
@@ -33,8 +36,8 @@ def doctor(
     with PlainConsole().status(f"examining {arm}"):
         findings = examine(arm, bus, offline)
     for found in findings:
-        console.print(found.level, style=COLOURS[found.level], end=": ")
-        console.print(str(found).replace(f"{Path.cwd()}/", ""))
+        said = f": {found}".replace(f"{Path.cwd()}/", "")
+        console.print(Text.assemble((found.level, COLOURS[found.level]), printable_text(said)))
     errors = sum(found.level == "error" for found in findings)
     if errors:
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to correct first")

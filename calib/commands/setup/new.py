@@ -206,7 +206,7 @@ def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
     for note in draft.notes:
         console.print(note, style="yellow")
     if draft.servo is not None:
-        console.print(f"joints at rest are held by their position loops: {draft.servo}", style="yellow")
+        console.print(f"joints at rest are held by their position loops, since {draft.servo}", style="yellow")
     show_findings(console, made.findings)
     console.print(
         f"{made.out} is written; {len(assumed_lines(made.text))} values are assumed, each is marked in the file"

@@ -125,11 +125,13 @@ _EFFECTS = {
 _OF_MOTORS = {
     "gain": (
         "drift",
-        "its drive reads {change:+.1%} ± {std:.1%} more torque: measure its torque constant with creep sweeps",
+        "its drive reads {change:+.1%} ± {std:.1%} more torque: measure its torque constant anew, with creep "
+        "sweeps, when the arm is free for them",
     ),
     "offset": (
         "drift",
-        "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset with creep sweeps",
+        "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset anew, "
+        "with creep sweeps, when the arm is free for them",
     ),
     "friction": ("effect", "its friction has changed by {change:+.0%} ± {std:.0%}"),
 }

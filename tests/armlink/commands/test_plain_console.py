@@ -1,10 +1,13 @@
-"""Sentences are never broken nor read as styles; tables fit the width; nothing in a name acts on the terminal."""
+"""Sentences are broken between words on a terminal alone and never read as styles; tables fit the width; nothing in a
+name acts on the terminal.
+"""
 
 import ast
 import io
 import json
 import logging
 import re
+import sys
 import unicodedata
 from pathlib import Path
 
@@ -17,8 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from armlink import cli
-from armlink.commands.plain_console import PlainColumn, PlainConsole
-from armlink.content.printable_text import PrintableFormatter, printable_json, printable_text
+from armlink.commands.plain_console import PlainColumn, PlainConsole, suggest
+from armlink.content.printable_text import PrintableFormatter, printable_json, printable_text, wrapped
 from calib.daemon.logs import JsonFormatter
 
 COMMAND = (
@@ -63,6 +66,54 @@ def is_harmless(text: str) -> bool:
 def test_a_command_comes_in_one_piece_with_its_brackets(capsys):
     PlainConsole().print(COMMAND, style="bold")
     assert capsys.readouterr().err == f"{COMMAND}\n"
+
+
+SENTENCE = (
+    "j2s6s200_joint_1 has no limits: give its stops with `--stops j2s6s200_joint_1:-2.1:2.1`, or Enter for a range of "
+    "2.9 rad to either side"
+)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_sentence_is_broken_between_words_on_a_terminal_and_nowhere_else(capsys):
+    console = PlainConsole()
+    console.file, console.width = Terminal(), 60
+    console.print(SENTENCE, style="yellow")
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", console.file.getvalue()).splitlines()
+    assert len(lines) == 3
+    assert max(map(len, lines)) <= 60
+    assert " ".join(lines) == SENTENCE
+    assert "`--stops j2s6s200_joint_1:-2.1:2.1`" in lines[1], "a command comes in one piece"
+    PlainConsole().print(SENTENCE)
+    assert capsys.readouterr().err == f"{SENTENCE}\n"
+
+
+def test_the_next_command_is_not_broken_on_a_terminal(monkeypatch):
+    monkeypatch.setattr("sys.stderr", Terminal())
+    suggest(COMMAND.removeprefix("next: "))
+    assert COMMAND in sys.stderr.getvalue()
+
+
+def test_an_error_and_the_list_of_commands_are_broken_between_words_on_a_terminal(monkeypatch):
+    for stream in ("stdout", "stderr"):
+        monkeypatch.setattr(f"sys.{stream}", Terminal())
+    assert cli.run(["--help"]) == 0
+    assert max(map(len, sys.stdout.getvalue().splitlines())) <= 62, "a line of options"
+    cli._fail(SENTENCE, 2)
+    assert " ".join(sys.stderr.getvalue().splitlines()) == f"armlink: {SENTENCE}"
+    assert max(map(len, sys.stderr.getvalue().splitlines())) <= 60
+
+
+@given(st.text(st.sampled_from("ab `"), max_size=60), st.integers(1, 40))
+def test_wrapping_turns_single_spaces_into_breaks(text, width):
+    lines = wrapped(text, width).split("\n")
+    assert " ".join(lines) == text
+    for line in lines:
+        assert len(line) <= width or not re.search(r"^[^ `]+ +[^ `]+", line), "longer only where it cannot be broken"
 
 
 def test_a_table_fits_the_width(capsys):

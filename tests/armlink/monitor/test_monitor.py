@@ -2,6 +2,7 @@
 
 import os
 
+import can
 import pytest
 
 from armlink.bus.open import open_link_bus
@@ -21,4 +22,20 @@ def test_its_own_syncs_count_once_on_a_bus_that_returns_them(arm_of, stats):
         assert view.rate_hz <= 101.0
         assert (monitor.cycle_stats and monitor.cycle_stats.report().cycles) == (49 if stats else None)
     finally:
+        opened.shutdown()
+
+
+def test_frames_that_waited_before_the_first_view_are_not_counted_in_its_rate(arm_of):
+    """A process that starts slowly, such as a command, opens the bus long before it watches."""
+    arm = arm_of(2, link={"bus": {"interface": "virtual", "channel": "waiting"}, "rate": 100})
+    opened, host = open_link_bus(None, arm.require_link()), can.Bus(interface="virtual", channel="waiting")
+    try:
+        monitor = Monitor(arm, opened)
+        for _ in range(1500):
+            host.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        view = monitor.watch(0.05)
+        assert monitor.frames == 1500
+        assert view.rate_hz == view.load == 0.0
+    finally:
+        host.shutdown()
         opened.shutdown()

@@ -17,8 +17,9 @@ from armlink.errors import BadInput, Refused
 from armlink.link.integral import slowest_time
 from armlink.link.types import Sample
 from calib.arm.sweep_section import SweepSection
-from calib.commands.screen import unsettled_lines
-from calib.dataset import DataWriter, Manifest, PlanLine, encode, load_data
+from calib.commands.screen import _short, confirm, stall_lines, unsettled_lines
+from calib.commands.sweep import next_step
+from calib.dataset import DataWriter, Manifest, PlanLine, StallLine, SweepData, encode, load_data
 from calib.motion.mover import STOP_TOLERANCE, Mover
 from calib.motion.static_reading import SettleRule, StaticReading
 from calib.motion.trajectory import trajectory
@@ -268,7 +269,70 @@ def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     swung = replace(data.readings[0], settled=False)
     (line,) = unsettled_lines(replace(data, readings=(swung, *data.readings[1:])))
     assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
-    assert "in scout: these readings count less" in line
+    assert "in the rough gravity model: these readings count less" in line
+
+
+def test_people_are_told_of_readings_without_the_words_of_the_file() -> None:
+    arm = random_arm(1, 3)
+    data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
+    stalls = [StallLine(t=1.0, late_ms=None, reading=each, reason="") for each in ("scout 6", "j2.1 3", "end")]
+    (line,) = stall_lines(replace(data, stalls=tuple(stalls)))
+    assert line.endswith(": rough gravity model, pose 6, j2.1, reading 3, end")
+
+
+def test_without_a_terminal_it_is_said_what_moves_and_that_nobody_is_asked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    confirm("bench will move", "Is its space clear?")
+    said = capsys.readouterr().err
+    assert said == "bench will move. Is its space clear? Without a terminal nobody is asked, and it moves now\n"
+
+
+def swept(folder: Path, mass: float, seconds: int, speed: float | None = None) -> SweepData:
+    """A whole pass on disk that was begun so many seconds after the first."""
+    arm = random_arm(1, 3)
+    data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), mass, np.random.default_rng(0))
+    assert data.plan is not None
+    plan = data.plan.model_copy(
+        update={"sweeps": tuple(each.model_copy(update={"speed": speed}) for each in data.plan.sweeps)}
+    )
+    manifest = Manifest.of(arm, mass)
+    manifest = manifest.model_copy(update={"created": manifest.created.replace(year=2020, second=seconds)})
+    with DataWriter(folder, manifest) as writer:
+        for line in (*data.readings, PlanLine(plan=plan, resolution=(0.0,) * 3)):
+            writer.append(line)
+    return load_data(folder)
+
+
+def test_the_next_command_names_the_passes_that_are_there(tmp_path: Path) -> None:
+    again, first = ["sweep", "arm.yaml"], swept(tmp_path / "un", 0.0, 0)
+    _, step = next_step(first, again)
+    assert step[2:3] + step[4:] == ["--reference-mass", "--out", str(tmp_path / "un-loaded")]
+    _, step = next_step(swept(tmp_path / "unloaded", 0.0, 3), again)
+    assert step[-1] == str(tmp_path / "loaded")
+    alone = swept(tmp_path / "elsewhere" / "lo", 2.0, 1)
+    assert next_step(alone, again)[1] == [*again, "--out", str(tmp_path / "elsewhere" / "unloaded")]
+    (tmp_path / "of-another-program" / "manifest.json").parent.mkdir()
+    (tmp_path / "of-another-program" / "manifest.json").write_text("{}")
+    swept(tmp_path / "later", 0.0, 9)
+    loaded = swept(tmp_path / "lo", 2.0, 1)
+    assert next_step(loaded, again)[1] == ["calibrate", str(tmp_path / "un"), str(tmp_path / "lo")]
+
+
+def test_creep_sweeps_are_fitted_after_the_third_pass(tmp_path: Path) -> None:
+    again, names = ["sweep", "arm.yaml"], [str(tmp_path / name) for name in ("un", "lo", "un-again")]
+    swept(tmp_path / "un", 0.0, 0, speed=0.1)
+    loaded = swept(tmp_path / "lo", 2.0, 1, speed=0.1)
+    assert next_step(loaded, again)[1] == [*again, "--out", names[2]]
+    assert next_step(swept(tmp_path / "un-again", 0.0, 2, speed=0.1), again)[1] == ["calibrate", *names]
+
+
+def test_long_names_of_joints_are_numbers_in_the_heads_of_a_narrow_plan() -> None:
+    names = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint")
+    assert _short(names, 40) == ["1", "2", "3"]
+    assert _short(names, 100) == [*names]
+    assert _short(("joint_a2", "joint_a3"), 100) == ["2", "3"]
 
 
 def test_a_missing_number_stays_missing(tmp_path: Path) -> None:

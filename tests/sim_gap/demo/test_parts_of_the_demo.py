@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.observer.decision import Event
+from calib.observer.watch_loop import WatchHistory
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import drifting_joint
-from sim_gap.demo.run import BY, Demo
+from sim_gap.demo.run import BY, Demo, last_word
 
 
 @pytest.mark.parametrize(
@@ -48,6 +50,12 @@ def test_a_summary_sets_what_was_found_beside_the_truth(monkeypatch) -> None:
     }
     assert made["not_identifiable"] == {"elbow.offset": "no sweep tells it"}
     assert made["drift"] is None
+
+
+def test_a_drift_that_stays_has_its_reason() -> None:
+    history = WatchHistory(events=[Event(3.0, "undecided", "j1", {"reasons": ["the gain is known only to ± 2 %"]})])
+    assert last_word(history, 2.0) == "j1: the calibration was not changed: the gain is known only to ± 2 %"
+    assert last_word(history, 4.0) == "the observer saw no change"
 
 
 def test_its_records_are_signed_with_the_command() -> None:

@@ -206,6 +206,8 @@ def scan_report(
         else:
             table.add_row(str(each.node), each.joint, Text("no answer", style="red"))
     show(table)
+    if any(each.present for each in found):
+        show("identity: vendor:product:revision, hexadecimal, as the drive states it (1018h)")
     for lost in dict.fromkeys(lost for each in found for lost in each.lost):
         lacking = [each.joint for each in found if lost in each.lost]
         show(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}")
