@@ -30,7 +30,8 @@ import yaml
 from armlink.arm_file import bundled_arms
 
 ARMLINK = str(Path(sys.executable).with_name("armlink"))
-FAMILIES = ("cia402", "damiao", "robstride", "moteus", "odrive", "myactuator", "cubemars", "piper")
+FAMILIES = ("cia402", "damiao", "robstride", "moteus", "odrive", "myactuator", "piper")
+"""CubeMars drives are only heard beside their host: what would ask them commands them."""
 ABSENT, AS_DELIVERED = 2, 3
 """Joints of the drive without power and of the one whose reply id is 0."""
 SHORT = {"motion": "steps", "steps": 5, "poses": 1, "loaded_poses": 1, "hold": "servo", "standard_error": 0.005}

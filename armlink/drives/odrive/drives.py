@@ -351,10 +351,12 @@ def _checked(value: float) -> float:
 
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:
-    """By the heartbeats heard; another device's frames on such an identifier hardly all are ones."""
-    known, beats = sum(AxisError), dict[int, list[bool]]()
+    """By the heartbeats heard; another device hardly sends nothing but CANSimple on its identifiers."""
+    known, beats, others = sum(AxisError), dict[int, list[bool]](), set[int]()
     for can_id, data in bus.heard:
-        if can_id <= 0x7FF and can_id & 0x1F == Message.HEARTBEAT:
+        if can_id <= 0x7FF and can_id & 0x1F not in iter(Message):
+            others.add(can_id >> 5)
+        elif can_id <= 0x7FF and can_id & 0x1F == Message.HEARTBEAT:
             beat = frames.heartbeat(data)
             real = beat is not None and not beat.error & ~known and beat.state <= max(AxisState) and beat.done <= 1
             beats.setdefault(can_id >> 5, []).append(real)
@@ -363,7 +365,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
         if node < 0x3F
         else FoundDrive("odrive", node, f"node {node}", wrong="an axis without a node id: set axis0.config.can.node_id")
         for node, real in sorted(beats.items())
-        if len(real) > 1 and all(real)
+        if len(real) > 1 and all(real) and node not in others
     ]
 
 

@@ -20,6 +20,7 @@ from armlink.drives.odrive.frames import Heartbeat, Message, identifier, pack
 from sim_bus.bus.lock_step import LockStepBus
 
 ARMS = ["six-cia402", "openarm", "six-robstride", "six-moteus", "six-odrive", "six-myactuator"]
+"""Of the families whose drives have ids; Piper's joints have none."""
 
 
 def reads(can_id: int, data: bytes) -> bool:
@@ -194,6 +195,14 @@ def test_beside_a_family_that_its_requests_command_none_is_asked(tmp_path, monke
     assert [each["address"] for each in found] == [f"node {48 + place}" for place in range(6)]
     assert re.search(r"not for .*canopen.* \(requests to them could command the odrive drives, or be taken for", told)
     assert not [can_id for can_id, _ in sent if can_id == 0x7FF or 0x601 <= can_id <= 0x67F]
+
+
+def test_a_piper_is_no_odrive_axis(tmp_path, monkeypatch, capsys):
+    """Its status comes on the identifier of a heartbeat of node 21, with values that one may have."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.yaml").write_text(bundled_arms()["six-piper"].read_text())
+    found, _ = scanned(capsys)
+    assert [(each["family"], each["address"]) for each in found] == [("piper", f"joint {n}") for n in range(1, 7)]
 
 
 def test_a_heartbeat_is_no_other_device_s_frame():

@@ -138,3 +138,24 @@ def test_a_joint_that_strikes_its_stop_and_turns_round_is_not_contradicted() -> 
         t = cycle * PERIOD
         watch.update([position], [t], [t], [velocity], [t])
         assert not watch.contradicted[0]
+
+
+def test_answers_to_other_requests_do_not_make_readings_that_catch_up_a_second_node():
+    bus = BusWatch(1)
+
+    def cycle(came: int) -> None:
+        bus.syncs += 1
+        for number in range(came):
+            bus.readings[0] += 1
+            if number:
+                bus.again(0)
+        bus.cycle_ends(came)
+
+    for came in [1, 2, 1, 1, 2, 1, 1, 2, 1]:  # three requests beside the cycle are answered
+        cycle(came)
+    for came in [0, 0, 0, 0, 2, 2, 2, 2, 1]:  # the host is late by four cycles
+        cycle(came)
+        assert bus.doubled is None
+    for _ in range(3):
+        cycle(2)
+    assert bus.doubled == 0
