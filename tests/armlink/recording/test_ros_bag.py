@@ -274,7 +274,7 @@ def test_a_lerobot_data_set_without_names_or_rows_is_one_line(tmp_path, info):
     with pytest.raises(BadInput, match="have no rows"):
         load_recording(tmp_path)
     (tmp_path / "meta" / "info.json").write_text(info)
-    with pytest.raises(BadInput, match="joint names of observation"):
+    with pytest.raises(BadInput, match="joint names for the feature observation"):
         load_recording(tmp_path)
 
 
@@ -300,7 +300,7 @@ def test_a_foreign_table_gets_a_map_to_paste(tmp_path):
         ({"zero": ["q_1=a"]}, "--zero q_1=a: expected a number"),
         ({"columns": ["q_1"]}, "--map q_1: expected COLUMN=VALUE"),
         ({"columns": ["q_1=nope"]}, "--map q_1=nope: the file has no column nope"),
-        ({"joints": "x,y"}, "--joints x: .* has no such joint"),
+        ({"joints": "x,y"}, "--joints x: .* has no joint of this name"),
         ({"effort_is": "gear"}, "--effort-is gear: expected motor, link, without-gravity"),
     ],
 )
