@@ -102,7 +102,7 @@ def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:
         return recording
     missing = [name for name in stated.joints if name not in recording.names]
     if missing:
-        raise BadInput(f"--joints {missing[0]}: {label} has no joint of this name: {', '.join(recording.names)}")
+        raise BadInput(f"--joints {missing[0]}: {label} has only the joints {', '.join(recording.names)}")
     left = [name for name in recording.names if name not in stated.joints]
     chosen = take_joints(recording, [recording.names.index(name) for name in stated.joints])
     note = f"joints left out: {', '.join(left)}" if left else ""
