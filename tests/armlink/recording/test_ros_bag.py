@@ -274,7 +274,7 @@ def test_a_lerobot_data_set_without_names_or_rows_is_one_line(tmp_path, info):
     with pytest.raises(BadInput, match="have no rows"):
         load_recording(tmp_path)
     (tmp_path / "meta" / "info.json").write_text(info)
-    with pytest.raises(BadInput, match="joint names for the feature observation"):
+    with pytest.raises(BadInput, match="joint names of observation"):
         load_recording(tmp_path)
 
 
