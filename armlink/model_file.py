@@ -104,7 +104,7 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
         with model_budget(path):
             spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
-        raise BadInput(f"{path}: not a model that MuJoCo reads: {one_line(error)}") from None
+        raise BadInput(f"{path}: MuJoCo cannot read this model: {one_line(error)}") from None
     finally:
         mujoco.set_mju_user_warning(log.info)
     if any("NaN" in line for line in warned):  # it takes some of them for values that are not given
@@ -176,10 +176,10 @@ def _rest_at(spec: Any, name: str, position: float, path: Path) -> None:
     joint = spec.joint(name)
     if joint is None:
         joints = ", ".join(each.name for each in spec.joints)
-        raise BadInput(f"{path}: there is no joint {name!r} to lock; there are {joints}")
+        raise BadInput(f"{path}: there is no joint {name!r} to lock; the joints are {joints}")
     hinge, body = joint.type == mujoco.mjtJoint.mjJNT_HINGE, joint.parent
     if not hinge and joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
-        raise BadInput(f"{path}: joint {name!r} cannot be locked: it neither turns about one axis nor slides along it")
+        raise BadInput(f"{path}: joint {name!r} cannot be locked: it is neither revolute nor prismatic")
     if body.joints[0].name != name:
         raise BadInput(
             f"{path}: joint {name!r} cannot be locked, since joint {body.joints[0].name!r} moves the same body"

@@ -259,7 +259,7 @@ def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
         if not isinstance(each, SweepData | str | Path):
             kind = type(each).__name__
             raise BadInput(
-                f"{function}: expected data sets of sweep or their folders, each as an argument of its own, not {kind}"
+                f"{function}: expected data sets of sweep or their folders, each as a separate argument, not {kind}"
             )
         given.append(Path(each) if isinstance(each, str) else each)
     return data_sets(given)
@@ -276,7 +276,7 @@ def identified(arm_file: ArmFile, data: list[SweepData], sensors: Calibrated | C
     """Mass moments from data sets and their sensors, by their motion; raises BadInput, Refused."""
     if isinstance(sensors, CreepFit if not all_creep(data) else SensorFit):
         raise BadInput(
-            "identify: `sensors` were found in sweeps of the other kind (creep or steps): leave this argument out"
+            "identify: `sensors` come from sweeps of the other kind (creep or steps): leave this argument out"
         )
     return sensors.gravity if isinstance(sensors, CreepFit) else identify_gravity(arm_file, data, sensors)
 

@@ -180,7 +180,7 @@ class SweepData:
         for what, (ours, wanted) in differing.items():
             if ours != wanted:
                 raise Refused(
-                    f"{self.path}: {what} is {ours}, but must be {wanted}: this data set was swept with something else"
+                    f"{self.path}: {what} is {ours}, but must be {wanted}: the data set is of another arm or arm file"
                 )
         return self
 

@@ -88,11 +88,11 @@ class FrameLog:
     def __init__(self, path: Path) -> None:
         """Create the file; raises BadInput for another suffix or a file that cannot be written."""
         if path.suffix.lower() not in LOG_SUFFIXES:
-            raise BadInput(f"{path}: this suffix is not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
+            raise BadInput(f"{path}: not a file name for a frame log: expected {', '.join(LOG_SUFFIXES)}")
         try:
             self._writer = can.Logger(str(path))
         except OSError as error:
-            raise BadInput(f"{path}: cannot write it: {error.strerror}") from None
+            raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
         if hasattr(self._writer, "max_container_size"):
             self._writer.max_container_size = _CONTAINER
         self._flushed = 0
@@ -161,7 +161,7 @@ class LogReader:
         if not path.is_file():
             raise BadInput(f"there is no frame log {path}: give a {', '.join(READ_SUFFIXES)} file")
         if not is_log(path):
-            raise BadInput(f"{path}: this suffix is not the suffix of a frame log, expected {', '.join(READ_SUFFIXES)}")
+            raise BadInput(f"{path}: not a file name of a frame log: expected {', '.join(READ_SUFFIXES)}")
         if _kind(path) == ".blf" and path.suffix.lower() == PACKED:
             raise BadInput(f"{path}: BLF files are compressed already: unpack this file first (gunzip)")
         self._path, self._timeless = path, 0

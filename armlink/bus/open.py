@@ -77,7 +77,7 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     bus = resolve_bus(spec, section)
     if is_listening(bus):
         raise BadInput(
-            f"bus {bus.interface}:{bus.channel}: armlink only listens there: use record, monitor, observe, or "
+            f"bus {bus.interface}:{bus.channel}: this bus is listen-only: use record, monitor, observe, or "
             "daemon --listen-only, with an arm file"
         )
     import can

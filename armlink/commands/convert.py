@@ -37,7 +37,7 @@ def convert(
     try:
         save_recording(recording, target)
     except OSError as error:
-        raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
+        raise BadInput(f"{target}: cannot be written: {error.strerror}") from None
     if recording.warning:
         PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
     rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])

@@ -98,7 +98,7 @@ def monitor(
             write_json(json, {"arm": arm_file.name, "serial": arm_file.serial, **answer})
     if not any(map(_is_heard, answer["joints"])):
         why = silence_of(opened, "does a host send SYNC? (--sync sends it)")
-        raise BusFault(f"{title}: no joint is heard: {why}")
+        raise BusFault(f"{title}: no joint sends data: {why}")
     return 0
 
 

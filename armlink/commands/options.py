@@ -38,7 +38,7 @@ def stated_bus(bus: str | None, ros2: str | None, lerobot: str | None) -> str | 
 
     given = [each for each in (bus, ros2 and f"ros2:{ros2}", lerobot and f"lerobot:{lerobot}") if each]
     if len(given) > 1:
-        raise BadInput("--bus, --ros2 and --lerobot: give one of them")
+        raise BadInput("--bus, --ros2 and --lerobot: give only one of these options")
     return given[0] if given else None
 
 

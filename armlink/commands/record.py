@@ -72,7 +72,7 @@ def record(
                         writer.append(t, channels)
                     rows, last = rows + 1, t
         except OSError as error:
-            raise BadInput(f"{out or frames}: cannot write it: {error.strerror}") from None
+            raise BadInput(f"{out or frames}: cannot be written: {error.strerror}") from None
     if not rows:
         if out:
             out.unlink(missing_ok=True)

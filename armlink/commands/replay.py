@@ -56,7 +56,7 @@ def replay(
         try:
             save_recording(recording, target)
         except OSError as error:
-            raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
+            raise BadInput(f"{target}: cannot be written: {error.strerror}") from None
         out.print(f"{target}: {recording.t.size} rows")
     else:
         show(recording, out, speed)

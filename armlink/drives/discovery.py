@@ -49,7 +49,7 @@ class AskedDrives:
         found = dict(zip((each.address for each in self.found), self._drives.positions(self._bus), strict=True))
         silent = [address for address, position in found.items() if position != position]
         if silent:
-            raise BusFault(f"{self._bus.channel_info}: {', '.join(silent)}: no position at the output is reported")
+            raise BusFault(f"{self._bus.channel_info}: {', '.join(silent)}: no output position is reported")
         return found
 
 
@@ -103,7 +103,7 @@ class BusDrives:
     def require_own_ids(self) -> None:
         twins = ", ".join(str(node["address"]) for node in self.nodes if node["answers"] > 1)
         if twins:
-            raise BusFault(f"{self._channel}: {twins} answers twice: give every drive an id of its own")
+            raise BusFault(f"{self._channel}: {twins} answers twice: give every drive its own id")
 
     def positions(self) -> dict[str, float]:
         return {key: each for part in self.parts if part.found for key, each in part.positions().items()}

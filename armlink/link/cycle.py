@@ -398,8 +398,8 @@ class Commander:
         wrong = beyond(limits, passed, sent, self._seen_now[joint])
         if wrong:
             raise Refused(
-                f"gate: {self.names[joint]}: the frame would order {wrong}, the limits are {limits.most_sent:.6g} N·m "
-                f"and {limits.lower:.4g} to {limits.upper:.4g} rad: the frame is not sent"
+                f"gate: {self.names[joint]}: the frame would command {wrong}, but the limits are "
+                f"{limits.most_sent:.6g} N·m and {limits.lower:.4g} to {limits.upper:.4g} rad: the frame is not sent"
             )
 
     def _fault(self, now: float, modes: Sequence[int]) -> BusFault | None:

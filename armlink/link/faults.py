@@ -124,7 +124,7 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
     if doubled is not None:
         return (
             f"{names[doubled]}: two readings come in every cycle, so a second node has the same id: give every node "
-            "an id of its own"
+            "its own id"
         )
     if watch.babbling:
         return (
@@ -134,7 +134,7 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
     if watch.forged is not None:
         return (
             f"{names[watch.forged]}: more readings come than this joint sends, so a second node sends torques, "
-            "velocities or states with the same id: find the sender, and give every node an id of its own"
+            "velocities or states with the same id: find the sender, and give every node its own id"
         )
     if dropped:
         return (

@@ -80,7 +80,7 @@ class Link(Calibrations):
         if isinstance(self.bus, ListeningBus):
             self.bus.shutdown()
             raise BadInput(
-                f"bus {self.bus.channel_info}: armlink only listens there, and this command needs the drives: use "
+                f"bus {self.bus.channel_info}: this bus is listen-only, but this command needs the drives: use "
                 "record, monitor, observe, or daemon --listen-only"
             )
         self.section = section = arm.require_link()

@@ -69,8 +69,8 @@ def require_deadman(link: Parked) -> None:
         if each.reaction(link.section.keeper) == "keeps on":
             instead = ", or set `link.keeper: true` (docs/safety.md, keeper)" if each.kept else ""
             raise Refused(
-                f"{name}: if this host dies, its drive keeps on with the last command (`silence: keeps on`), so "
-                "this joint is not driven: choose a firmware or a setting with which the drive watches its "
+                f"{name}: if this host dies, the drive goes on with its last command (`silence: keeps on`), so "
+                "this joint is not enabled: choose a firmware or a setting with which the drive monitors its "
                 f"host{instead}"
             )
 

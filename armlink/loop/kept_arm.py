@@ -102,7 +102,7 @@ class KeptArm(CycleProcess):
             return answer.result(HANG_SECONDS)
         except TimeoutError:
             self._waiting.pop(call.id, None)
-            return LoopAnswer(call.id, error=BusFault(f"no answer of the bus loop within {HANG_SECONDS:g} s"))
+            return LoopAnswer(call.id, error=BusFault(f"no answer from the bus loop within {HANG_SECONDS:g} s"))
 
     def close(self, cause: EndCause = EndCause.DONE, tell: Tell = lambda text: None) -> None:
         with self._sending:

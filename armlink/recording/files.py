@@ -36,7 +36,7 @@ def load_recordings(path: str | Path, stated: Corrections | None = None, poses: 
         found = _loaded(place, stated, poses)
     if episode.isdigit() and folder:
         if str(path) not in found:
-            raise BadInput(f"{path}: no such episode: {folder} has {len(found)}, counted from 0")
+            raise BadInput(f"{path}: no such episode: {folder} has {len(found)} episodes, numbered from 0")
         found = {str(path): found[str(path)]}
     return {label: stated.apply(_chosen(r, stated, label), label).check(label) for label, r in found.items()}
 
@@ -102,7 +102,7 @@ def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:
         return recording
     missing = [name for name in stated.joints if name not in recording.names]
     if missing:
-        raise BadInput(f"--joints {missing[0]}: {label} has no such joint: it has {', '.join(recording.names)}")
+        raise BadInput(f"--joints {missing[0]}: {label} has only the joints {', '.join(recording.names)}")
     left = [name for name in recording.names if name not in stated.joints]
     chosen = take_joints(recording, [recording.names.index(name) for name in stated.joints])
     note = f"joints left out: {', '.join(left)}" if left else ""

@@ -78,7 +78,7 @@ def _features(path: Path) -> dict[str, Any]:
             f"{path}/meta/info.json: cannot read the joint names of {STATES[0]} ({type(error).__name__} {error})"
         ) from None
     if not isinstance(features, dict) or not any(name in features for name in STATES):
-        raise BadInput(f"{path}/meta/info.json: its features have no joint names of {' or '.join(STATES)}")
+        raise BadInput(f"{path}/meta/info.json: there are no joint names of {' or '.join(STATES)}")
     return features
 
 

@@ -69,7 +69,7 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
     """
     if not is_virtual(parse_bus(spec)):
         raise BadInput(
-            f"bus {spec}: replay goes onto a virtual bus only: virtual:…, udp_multicast:… or socketcan:vcan…"
+            f"bus {spec}: replay is possible only on a virtual bus: virtual:…, udp_multicast:… or socketcan:vcan…"
         )
     bus = open_bus(spec, arm.require_link().bus)
     try:

@@ -113,7 +113,7 @@ def external(
         with PlainConsole().status("learning what the arm does without contact"):
             listener = listener_of(records, free, list(judged.values()))
         if free and not listener.model.seconds:
-            raise BadInput(f"--baseline: no recording has {SHORTEST:g} s without a gap: record for longer")
+            raise BadInput(f"--baseline: no recording has {SHORTEST:g} s without missing rows: record for longer")
         if learned is not None:
             save_learned(learned, Learned(listener, place, per_hour))
             console.print(f"{learned} is written: it holds {listener.model.seconds:.0f} s of work without contact")
@@ -135,7 +135,7 @@ def external(
     for label, recording in judged.items():
         heard = list(listen(listener, recording, place, per_hour))
         if not heard:
-            raise BadInput(f"{label}: it has no {SHORTEST:g} s without a gap, which judging needs: record for longer")
+            raise BadInput(f"{label}: it has no {SHORTEST:g} s without missing rows, but needs them: record for longer")
         every += heard
         answers.append(answer_of(label, heard, names))
         _tell(console, answers[-1], names)

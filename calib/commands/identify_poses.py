@@ -80,7 +80,7 @@ def judged_fit(
         return Judged(model, fit, fit.held_out(), plain.held_out())
     held, other, _ = load_poses(heldout, model, masses, stated)
     if other != channel:
-        raise BadInput(f"--heldout {heldout[0]}: torque is in another channel than that of the poses")
+        raise BadInput(f"--heldout {heldout[0]}: its torque channel differs from that of the poses")
     return Judged(model, fit, rms(fit.errors(held)), rms(plain.errors(held)))
 
 
@@ -96,7 +96,7 @@ def reference_masses(given: Sequence[str], poses: Sequence[Path]) -> dict[str, f
         if not path or not 0 < mass < np.inf:
             raise BadInput(f"--reference-mass {text}: expected FILE=KG, such as loaded.csv=2.5")
         if Path(path) not in poses:
-            raise BadInput(f"--reference-mass {text}: {path} is not one of the poses given")
+            raise BadInput(f"--reference-mass {text}: {path} is not one of the given files of poses")
         masses[str(Path(path))] = mass
     return masses
 

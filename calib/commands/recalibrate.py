@@ -121,7 +121,7 @@ def _rows(
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
         if digest in sources.values():
             twin = next(name for name, known in sources.items() if known == digest)
-            raise BadInput(f"{path} holds the same data as {twin}, which would count twice: give one of the two")
+            raise BadInput(f"{path} contains the same data as {twin}, which would count twice: leave one out")
         sources[label] = digest
     return parts[0].joined(*parts[1:]), sources
 

@@ -172,7 +172,7 @@ def find_chains(
         ends = [place for place, joint in enumerate(joints) if joint.body == tip]
         if not ends:
             moving = ", ".join(dict.fromkeys(joint.body for joint in joints))
-            raise BadInput(f"{path}: --tip {tip}: there is no such body that moves; the bodies that move are {moving}")
+            raise BadInput(f"{path}: --tip {tip}: no moving body has this name; the moving bodies are {moving}")
         way = _after(joints, [*joints[ends[-1]].parents, ends[-1]], base)
         if not way:
             raise BadInput(f"{path}: --base {base} --tip {tip}: there is no revolute joint between these bodies")

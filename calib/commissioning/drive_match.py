@@ -62,7 +62,7 @@ def match_in_order(names: Sequence[str], drives: FoundDrives, bus: str) -> list[
     if len(found) > len(names):
         raise BadInput(
             f"{bus}: {len(found)} drives answer ({addresses(found)}), the arm has {len(names)} joints: turn each joint"
-            " by hand with --by-hand, or disconnect the others"
+            " by hand with --by-hand, or disconnect the other drives"
         )
     return [Match(name, drive, by_hand=False) for name, drive in zip(names, found, strict=True)]
 

@@ -123,7 +123,7 @@ def _scale(records: ArmRecords, runs: Sequence[Samples]) -> Array:
         return np.asarray(arm_file.link.rated_torques)
     if not runs:
         raise BadInput(
-            "no recording is long enough to show the size of the torques, and no arm file gives rated torques"
+            "no recording is long enough to estimate the size of the torques, and no arm file gives rated torques"
         )
     largest = np.percentile(np.abs(np.concatenate([run.torque for run in runs])), LARGEST_SHARE, axis=0)
     return np.asarray(np.maximum(largest, 0.02 * largest.max()))

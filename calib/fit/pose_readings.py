@@ -31,7 +31,7 @@ def channel_of(recording: Recording, source: str) -> str:
         if values is not None and np.isfinite(values).any():
             return name
     wanted = ", ".join(f"{COLUMNS[name]}_1 …" for name in TORQUE_CHANNELS[:2])
-    raise BadInput(f"{source}: there is no torque and no current: expected the columns {wanted} (--map, --units)")
+    raise BadInput(f"{source}: no column of torques or currents: expected {wanted} (--map, --units)")
 
 
 def in_joint_order(recording: Recording, names: tuple[str, ...], source: str) -> Recording:
@@ -110,7 +110,7 @@ def load_poses(
             digest = hashlib.sha256(np.ascontiguousarray(np.hstack([recording.position, values])).tobytes()).hexdigest()
             if digest in sources.values():
                 twin = next(name for name, known in sources.items() if known == digest)
-                raise BadInput(f"{label} holds the same data as {twin}, which would count twice: give one of the two")
+                raise BadInput(f"{label} contains the same data as {twin}, which would count twice: leave one out")
             sources[label] = digest
     readings = parts[0].joined(*parts[1:])
     if len(readings) < FEWEST_ROWS:

@@ -100,7 +100,7 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
 def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
     """The readings of a sweep at rest; raises BadInput for creep sweeps, and if a reference mass was attached."""
     if data.creeps:
-        raise BadInput(f"{data.path}: creep sweeps: they belong to armlink calibrate {data.path}")
+        raise BadInput(f"{data.path}: these are creep sweeps: use armlink calibrate {data.path}")
     if data.manifest.reference_mass > 0:
         raise BadInput(
             f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the field "

@@ -67,7 +67,7 @@ def _require_shared(arm: ArmFile, drives: Sequence[str], known: Sequence[str], w
         raise Refused(
             f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of the drives {what} "
             f"({there[0]} …). Another arm has the same name and serial, so nothing was written: give "
-            f"each arm a serial of its own in its arm file ({arm.path.name}) and calibrate it"
+            f"each arm its own serial in its arm file ({arm.path.name}) and calibrate it"
         )
 
 

@@ -192,8 +192,8 @@ class Recalibrator:
         """
         if new.parent != self.record.id:
             raise Refused(
-                f"record {new.id} follows from record {new.parent}, but record {self.record.id} is current now: "
-                "it is superseded"
+                f"record {new.id} is based on record {new.parent}, but record {self.record.id} is current now: "
+                f"{new.id} is superseded"
             )
         self._require_current()
         recover(self._arm, self._store, self._controllers)

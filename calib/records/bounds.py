@@ -100,7 +100,7 @@ def _require_date(record: R, now: datetime | None) -> None:
     if now is not None and record.created > now + CLOCK_TOLERANCE:
         raise Refused(
             f"record {record.id} was created on {record.created:%Y-%m-%d %H:%M %Z}, but the clock of this machine says "
-            f"{now:%Y-%m-%d %H:%M %Z}: a record over 26 h ahead is not made current: set the clock that is wrong"
+            f"{now:%Y-%m-%d %H:%M %Z}: a record over 26 h in the future cannot become current: correct the wrong clock"
         )
 
 

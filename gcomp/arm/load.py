@@ -160,7 +160,7 @@ def _joint(model: "mujoco.MjModel", name: str, path: Path) -> int:
     joint = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name))
     if joint < 0:
         names = ", ".join(model.joint(joint).name for joint in range(model.njnt))
-        raise BadModel(f"{path}: there is no joint {name!r} to lock; there are {names}")
+        raise BadModel(f"{path}: there is no joint {name!r} to lock; the joints are {names}")
     return joint
 
 

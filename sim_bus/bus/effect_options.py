@@ -86,7 +86,7 @@ def parse_drift(text: str, joints: Sequence[str]) -> SensorDrift:
     except ValueError:
         raise BadInput(f"--drift {text!r}: expected {DRIFT_FORM}") from None
     if drift.joint not in joints:
-        raise BadInput(f"--drift {text!r}: there is no joint {drift.joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"--drift {text!r}: there is no joint {drift.joint!r}; the joints are {', '.join(joints)}")
     if drift.gain == 0.0:
         raise BadInput(f"--drift {text!r}: a gain factor of 0 would remove the signal; expected {DRIFT_FORM}")
     return drift

@@ -24,7 +24,7 @@ SCHEMA = "armlink.blind-seal/1"
 def write_answer(folder: Path, name: str, answer: Mapping[str, Any]) -> None:
     """Write one answer as `folder/NAME.json`. Raises Refused once the folder is sealed."""
     if (folder / MANIFEST).exists():
-        raise Refused(f"{folder}: the answers are sealed already, so answer {name} comes too late: use another folder")
+        raise Refused(f"{folder}: the answers are already sealed, so {name} cannot be added: use another folder")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(answer, indent=1, ensure_ascii=False), encoding="utf-8")
 

@@ -153,7 +153,7 @@ def windows_of(
                 pieces.append(piece)
                 parts += made
     if not parts:
-        raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s has position readings without a break")
+        raise BadInput(f"{labels[0]}: there are no {LEAST_S:g} s of position readings without a break")
     longest = max(len(part["at"]) for part in parts)
     stacked = {name: np.stack([_padded(part[name], longest, name) for part in parts], axis=-1) for name in parts[0]}
     number_of = stacked.pop("recording").astype(np.intp)

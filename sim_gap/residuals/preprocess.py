@@ -259,14 +259,14 @@ def prepare(
     """
     if recording.n != arm.n:
         raise BadInput(
-            f"{label}: has {recording.n} joints, but the model has {arm.n}: give the model of the recorded arm"
+            f"{label} has {recording.n} joints, but the model has {arm.n}: give the model of the recorded arm"
         )
     raw_step = float(np.median(np.diff(recording.t)))
     span = float(recording.t[-1] - recording.t[0])
     if span > MOST_SAMPLES_PER_ROW * raw_step * recording.t.size:
         raise BadInput(
             f"{label}: {recording.t.size} rows over {span:.3g} s are mostly {raw_step:.2g} s apart: did "
-            "several rows get one time stamp? Record the times of sampling"
+            "several rows get the same time stamp? Record the times of sampling"
         )
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))

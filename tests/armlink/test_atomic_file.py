@@ -47,7 +47,7 @@ def test_a_convert_onto_a_file_on_a_full_disk_keeps_it(suffix, tmp_path, capsys)
     with full_disk():
         assert run(["convert", str(source), str(target)]) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"armlink: {target}: cannot write it: ")
+    assert error.startswith(f"armlink: {target}: cannot be written: ")
     assert error.count("\n") == 1
     assert target.read_bytes() == before
     assert sorted(each.name for each in tmp_path.iterdir()) == sorted([source.name, target.name])

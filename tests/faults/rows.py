@@ -143,7 +143,7 @@ ROWS = (
         "two readings of the joint per cycle, in three consecutive cycles, and more readings than SYNCs",
         4,
         QUICK_STOP,
-        "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own",
+        "joint_2: two readings come in every cycle, so a second node has the same id: give every node its own id",
     ),
     Row(
         "EMCY storm",

@@ -103,7 +103,7 @@ def test_an_open_link_takes_no_bus(tmp_path):
         (lambda: armlink.open_link("sarcos", "socketcan:vcan0", simulated=True), "leave out `bus` or `simulated`"),
         (lambda: armlink.open_link("sarcos", load=2.0), "only a simulated arm"),
         (lambda: armlink.calibrate(), "give at least one data set that `sweep` wrote"),
-        (lambda: armlink.calibrate(["a", "b"]), "each as an argument of its own, not list"),
+        (lambda: armlink.calibrate(["a", "b"]), "each as a separate argument, not list"),
         (lambda: armlink.identify("nosuch"), "nosuch"),
         (lambda: armlink.diagnose("sarcos", 3), "diagnose: train: expected recordings or their paths, not int"),
         (lambda: armlink.diagnose("sarcos", [None]), "not NoneType"),

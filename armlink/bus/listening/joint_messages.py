@@ -183,7 +183,7 @@ class ListeningBus(InProcessBus):
         )
 
     def put(self, can_id: int, data: bytes) -> None:
-        raise BusFault(f"{self.channel_info}: armlink only listens there: nothing can be sent")
+        raise BusFault(f"{self.channel_info}: this bus is listen-only: nothing can be sent")
 
     def open_listening_port(self) -> "ListeningPort":
         return ListeningPort(self)
@@ -319,7 +319,7 @@ def message_names(section: LinkSection) -> list[str]:
     """Names that messages have for the arm's joints: as the arm file says, by default the joints' own."""
     found = [row.settings.joint if row.settings.family == JOINT_STATE_FAMILY else row.name for row in section.joints]
     if len(found) > MOST_JOINTS:
-        raise BadInput(f"link.joints has {len(found)} joints, expected at most {MOST_JOINTS} that are listened to")
+        raise BadInput(f"link.joints has {len(found)} joints: armlink can listen to at most {MOST_JOINTS} joints")
     return found
 
 

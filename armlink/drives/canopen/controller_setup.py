@@ -143,7 +143,7 @@ def check_identity(services: NodeServices, joint: LinkJoint) -> None:
 def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
     """The refusal of a joint's controller, with what differs and how to fix it."""
     return Refused(
-        f"{name} (node {node}): another drive than the arm file states: {'; '.join(mismatches)}: connect the "
+        f"{name} (node {node}): not the drive in the arm file: {'; '.join(mismatches)}: connect the "
         "right arm, or correct `identity` or `eds` of this joint under link.joints"
     )
 
@@ -175,7 +175,7 @@ def offered_modes(services: NodeServices) -> int:
     if services.has(objects.TARGET_VELOCITY) and _enters(services, CYCLIC_VELOCITY, supports(told, CYCLIC_VELOCITY)):
         return offered | 1 << (CYCLIC_VELOCITY - 1)
     raise BusFault(
-        f"{services.joint} (node {services.node}): the drive enters none of the modes 8 and 1 (position) and "
+        f"{services.joint} (node {services.node}): the drive accepts none of the modes 8, 1 (position) and "
         f"9 (velocity): 6502h is {told:#x}"
     )
 

@@ -135,8 +135,8 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         for joint in arm.require_link().joints:
             if joint.settings.family == "canopen" and joint.bus in buses:
                 raise BadInput(
-                    f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
-                    "the CANopen node on another bus, or set another master id in the CubeMars drives (drive.reply)"
+                    f"{arm.path}: {joint.name}: a CANopen node would read CubeMars replies on id 0 as NMT commands: "
+                    "put the CANopen node on another bus, or set another master id in the CubeMars drives (drive.reply)"
                 )
 
     # ---- before the cycle

@@ -99,7 +99,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         section = arm.require_link()
         bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
         if not bus.fd:
-            raise BadInput(f"{arm.path}: {joints[0].name}: moteus drives need CAN FD: write `fd: true` at their bus")
+            raise BadInput(f"{arm.path}: {joints[0].name}: moteus drives need CAN FD: set `fd: true` for their bus")
 
     def routes(self) -> Mapping[int, int]:
         return self._joint_of

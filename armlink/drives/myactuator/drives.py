@@ -122,8 +122,8 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
             node = getattr(joint.settings, "node", 0) if joint.settings.family == "canopen" else 0
             if joint.bus in own and node - 0x40 in self._joint_of:
                 raise BadInput(
-                    f"{arm.path}: {joint.name}: node {node} takes replies of the MyActuator drive {node - 0x40} "
-                    "for commands (200h + node): give one of them another id"
+                    f"{arm.path}: {joint.name}: node {node} would read replies of the MyActuator drive {node - 0x40} "
+                    "as commands (200h + node): give one of them another id"
                 )
 
     # ---- identifiers

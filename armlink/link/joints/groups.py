@@ -35,7 +35,7 @@ def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:
         if other != joint.name:
             where = "one bus" if bus is None else bus.channel_info
             raise BadInput(
-                f"{other} and {joint.name} both have {address} on {where}: give each joint an id of its own on a bus"
+                f"{other} and {joint.name} both have {address} on {where}: give each joint its own id on a bus"
             )
         found.setdefault((joint.settings.family, tag), []).append(place)
     groups = []

@@ -65,7 +65,7 @@ def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
     """How a person is asked to turn a joint; None where drives are taken in order. Raises BadInput."""
     if by_hand and not interactive:
         raise BadInput(
-            "--by-hand: there is no terminal to ask on: run the command on a terminal, or leave `--by-hand` out"
+            "--by-hand needs a terminal for its questions: run the command on a terminal, or leave `--by-hand` out"
         )
     if by_hand is None and interactive:
         by_hand = confirm("Find each joint's drive by turning the joint by hand?", abort=False, default=True)

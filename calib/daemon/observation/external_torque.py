@@ -53,8 +53,8 @@ class ExternalTorque:
         def work() -> Learned:
             if not path.is_file():
                 raise BadInput(
-                    f"nothing is learned of this arm's own work: armlink external {arm.argument} --baseline "
-                    f"RECORDING --learned {path}, then have the daemon reload"
+                    f"nothing is learned yet from this arm's work: run armlink external {arm.argument} --baseline "
+                    f"RECORDING --learned {path}, then reload the daemon"
                 )
             stated = StatedModel(gcomp_arm(arm), None, None, None, arm)
             return load_learned(path, ArmRecords(stated, calibration, gravity.carrying(arm)))

@@ -173,7 +173,7 @@ class RecalibrationWorkflow:
         if self._jobs.busy or self._approved:
             raise NotPossible("another recalibration is under way: try again in a moment")
         if base != current:
-            raise NotPossible(f"proposal {number} follows from record {base}, but record {current} is current now")
+            raise NotPossible(f"proposal {number} is based on record {base}, but record {current} is current now")
 
         def approved() -> None:
             self._approved.append((row, by))

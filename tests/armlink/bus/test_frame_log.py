@@ -126,7 +126,7 @@ def test_only_what_joints_send_is_played_onto_a_bus_and_only_a_virtual_one(arm_o
     record(arm_of(2), tmp_path / "run.log")
     assert {can_id for _, can_id, _ in frames_of_log(arm_of(2), tmp_path / "run.log")} == {0x80, 0x181, 0x182, 0x281}
     recording = recording_of_log(arm_of(2), tmp_path / "run.log")
-    with pytest.raises(BadInput, match="virtual bus only"):
+    with pytest.raises(BadInput, match="only on a virtual bus"):
         play_onto(arm_of(2), tmp_path / "run.log", recording, "socketcan:can0", 0.0)
     with can.Bus(interface="virtual", channel="replayed") as listener:
         count = play_onto(arm_of(2), tmp_path / "run.log", recording, "virtual:replayed", 0.0)

@@ -50,7 +50,7 @@ def test_monitor_of_a_silent_bus_says_so(capsys):
     assert run(["monitor", "sarcos", "--bus", BUS, "--once", "--json", "-"]) == 3
     captured = capsys.readouterr()
     assert json.loads(captured.out)["joints"][0]["position"] is None
-    assert "no joint is heard: does a host send SYNC?" in captured.err.splitlines()[-1]
+    assert "no joint sends data: does a host send SYNC?" in captured.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

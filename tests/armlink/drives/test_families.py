@@ -609,7 +609,10 @@ def test_cubemars_ranges_are_the_models_or_those_of_the_arm_file(tmp_path):
         ([{**AK, "model": "AK1"}], "model 'AK1' is unknown: give one of AK10-9"),
         ([{**AK, "reply": 1}], "reply 0x01 is the id of the drive itself"),
         ([AK, {**AK, "id": 2, "reply": 1}], "j1: drive.reply 0x01 is also the id of commands to j0"),
-        ([AK, {"family": "canopen", "node": 5}], "j1: a CANopen node takes CubeMars replies on id 0 for NMT commands"),
+        (
+            [AK, {"family": "canopen", "node": 5}],
+            "j1: a CANopen node would read CubeMars replies on id 0 as NMT",
+        ),
         ([{**AK, "can_timeout": -1}], "drive.can_timeout: "),
     ],
 )

@@ -135,7 +135,7 @@ def test_the_torque_constant_is_rated_torque_over_rated_current_or_the_arm_file_
         ([{**DRIVE, "torque_constant": 0.3}], "torque_constant 0.3 is that of the motor before the gear"),
         (
             [DRIVE, {"family": "canopen", "node": 0x41}],
-            "j1: node 65 takes replies of the MyActuator drive 1 for",
+            "j1: node 65 would read replies of the MyActuator drive 1 as",
         ),
     ],
 )

@@ -78,7 +78,7 @@ def test_scan_shows_another_controller(tmp_path, capsys):
     path.write_text(yaml.safe_dump(content))
     assert run(["scan", str(path), "--bus", "armlink_sim:sarcos"]) == 1
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "joint_3 (node 3): another drive than the arm file states: 1018h:02 product code is 0x41524d4c" in last
+    assert "joint_3 (node 3): not the drive in the arm file: 1018h:02 product code is 0x41524d4c" in last
 
 
 def test_scan_shows_a_node_id_given_twice(capsys, monkeypatch):
@@ -91,7 +91,7 @@ def test_scan_shows_a_node_id_given_twice(capsys, monkeypatch):
 
     monkeypatch.setattr(LockStepBus, "put", twice)
     assert run(["scan", "--bus", "armlink_sim:sarcos"]) == 3
-    assert "node 4 answers twice: give every drive an id of its own" in capsys.readouterr().err.splitlines()[-1]
+    assert "node 4 answers twice: give every drive its own id" in capsys.readouterr().err.splitlines()[-1]
 
 
 # ---- modes
@@ -309,7 +309,7 @@ def test_a_node_id_given_twice_is_found_after_three_cycles(enabled, bus):
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 3
     assert says == (
-        "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own"
+        "joint_2: two readings come in every cycle, so a second node has the same id: give every node its own id"
     )
     assert all_stopped(bus)
 

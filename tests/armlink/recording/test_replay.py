@@ -33,6 +33,6 @@ def test_no_frame_of_a_replay_reaches_a_real_bus(monkeypatch, tmp_path, spec: st
     if virtual:
         assert replay.play_onto(arm, tmp_path, None, spec, 1.0) == 7
     else:
-        with pytest.raises(BadInput, match="virtual bus only"):
+        with pytest.raises(BadInput, match="only on a virtual bus"):
             replay.play_onto(arm, tmp_path, None, spec, 1.0)
     assert opened == [spec] * virtual

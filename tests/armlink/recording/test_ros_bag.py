@@ -300,7 +300,7 @@ def test_a_foreign_table_gets_a_map_to_paste(tmp_path):
         ({"zero": ["q_1=a"]}, "--zero q_1=a: expected a number"),
         ({"columns": ["q_1"]}, "--map q_1: expected COLUMN=VALUE"),
         ({"columns": ["q_1=nope"]}, "--map q_1=nope: the file has no column nope"),
-        ({"joints": "x,y"}, "--joints x: .* has no such joint"),
+        ({"joints": "x,y"}, "--joints x: .* has only the joints"),
         ({"effort_is": "gear"}, "--effort-is gear: expected motor, link, without-gravity"),
     ],
 )

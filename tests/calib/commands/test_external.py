@@ -155,8 +155,8 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
         ("arm.xml quiet.csv --frame j2,1", "JOINT,X,Y,Z"),
         ("arm.xml quiet.csv --out out.txt", "out.txt"),
         ("arm.xml --picture felt.svg --baseline free_1.csv --out out.csv", "give recordings to judge"),
-        ("arm.xml short.csv --baseline free_1.csv", "short.csv: it has no 1 s without a gap"),
-        ("arm.xml quiet.csv --baseline short.csv", "--baseline: no recording has 1 s without a gap"),
+        ("arm.xml short.csv --baseline free_1.csv", "short.csv: it has no 1 s without missing rows"),
+        ("arm.xml quiet.csv --baseline short.csv", "--baseline: no recording has 1 s without missing rows"),
         ("none.xml quiet.csv", "none.xml"),
     ],
 )

@@ -176,7 +176,7 @@ def test_the_models_own_moments_are_those_with_the_tool_of_the_arm_file(bench):
         ("poses.csv poses.csv --model arm.xml", "same data"),
         ("poses.csv --model arm.xml --reference-mass 2", "expected FILE=KG"),
         ("poses.csv --model arm.xml --reference-mass poses.csv=-1", "expected FILE=KG"),
-        ("poses.csv --model arm.xml --reference-mass other.csv=1", "not one of the poses"),
+        ("poses.csv --model arm.xml --reference-mass other.csv=1", "not one of the given files of poses"),
         ("poses.csv --model arm.xml --out-model x.obj", ".urdf or .xml"),
         ("poses.csv --model arm.xml --out-model /none/x.xml", "/none"),
         ("poses.csv --model sarcos --out-model x.urdf", "--out-model"),

@@ -402,7 +402,7 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     assert title.startswith("arm4 with the drives on ")
     assert rewired == [each for each in marks if not each.startswith(told_by_the_drives)]
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
-    assert "no terminal to ask" in capsys.readouterr().err
+    assert "--by-hand needs a terminal" in capsys.readouterr().err
 
 
 def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(tmp_path, monkeypatch, capsys):

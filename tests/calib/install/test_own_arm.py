@@ -61,7 +61,7 @@ def test_an_arm_that_shares_name_and_serial_with_one_written_before_is_refused(s
     for new in (NEW, record()):
         with pytest.raises(
             Refused,
-            match="Another arm has the same name and serial, so nothing was written: give each arm a serial of its own",
+            match="Another arm has the same name and serial, so nothing was written: give each arm its own serial",
         ):
             write(store, other, new)
     assert other.held == Controllers().held

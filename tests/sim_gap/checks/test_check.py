@@ -327,7 +327,7 @@ def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
     corrected, (finding,) = check(arm, replace(motor, t=stamped, velocity=None))
     assert finding.finding == "jitter"
     assert np.diff(corrected.t).min() > 0.009
-    with pytest.raises(BadInput, match="did several rows get one time stamp"):
+    with pytest.raises(BadInput, match="did several rows get the same time stamp"):
         check(arm, replace(motor, t=stamped, velocity=None), parse_corrections(clock=["t=0"]))
 
 

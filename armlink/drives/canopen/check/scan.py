@@ -76,7 +76,7 @@ def describe_type(device_type: int) -> str:
 def _require_own_ids(found: Collection[Identity], channel: str) -> None:
     twins = [str(each.node) for each in found if each.answers > 1]
     if twins:
-        raise BusFault(f"{channel}: node id {', '.join(twins)} answers twice: give every node an id of its own")
+        raise BusFault(f"{channel}: node id {', '.join(twins)} answers twice: give every node its own id")
 
 
 class FoundNodes:
@@ -144,7 +144,7 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupF
             continue
         for differs in identity_mismatches(expected_identity(joint, sheet), vars(drives.identities[node])):
             remedy = "connect the right arm, or correct identity under link.joints"
-            yield SetupFinding("error", f"another drive than the arm file states: {differs}", where, remedy)
+            yield SetupFinding("error", f"not the drive in the arm file: {differs}", where, remedy)
         if abs(drive.rated_torque - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
             what = (
                 f"the rated torque of the drive (6076h) is {drive.rated_torque:g} N·m, but the arm file has "
