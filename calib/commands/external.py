@@ -48,6 +48,10 @@ def external(
     bus: OtherBus = None,
     ros2: Ros2 = None,
     lerobot: LeRobot = None,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, metavar="PORT", help="While listening, serve to Foxglove; 0: a free port."),
+    ] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
@@ -122,7 +126,7 @@ def external(
 
         if records.stated.arm_file is None:
             raise BadInput(f"{arm}: listening needs an arm file, which says how; `armlink new` makes one")
-        follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file)
+        follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file, foxglove)
         return
     every: list[Heard] = []
     if not free and learned is None:

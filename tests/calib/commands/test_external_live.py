@@ -66,7 +66,9 @@ def test_a_push_is_told_while_the_arm_works(learned, monkeypatch, capsys, tmp_pa
     messages.sleep_until(fast.t)
     bus = ListeningBus(messages, "ros2:/joint_states", fast.file.joint_names, rate=50.0, clock=messages)
     monkeypatch.setattr(bus_open, "open_listening_bus", lambda *given: bus)
-    status, (header, *lines), said = followed(["--ros2", "/joint_states", "--seconds", "30", *known], capsys)
+    status, (header, *lines), said = followed(
+        ["--ros2", "/joint_states", "--seconds", "30", "--foxglove", "0", *known], capsys
+    )
     assert status == 0
     assert header["schema"] == "armlink.external-live/1"
     rows = [line for line in lines if "event" not in line]
@@ -79,6 +81,7 @@ def test_a_push_is_told_while_the_arm_works(learned, monkeypatch, capsys, tmp_pa
     assert {"force", "force_std", "moment", "moment_std", "load"} <= set(rows[0])
     assert f"{last['t']:9.2f} s  {last['kind']}" in said
     assert "± " in said
+    assert "Foxglove: open ws://localhost:" in said
     assert "force at joint_7: x" in said
 
 
