@@ -24,16 +24,18 @@ def load_recording(path: str | Path, stated: Corrections | None = None) -> Recor
     return next(iter(found.values()))
 
 
-def load_recordings(path: str | Path, stated: Corrections | None = None, poses: bool = False) -> dict[str, Recording]:
+def load_recordings(
+    path: str | Path, stated: Corrections | None = None, poses: bool = False, efforts: bool = False
+) -> dict[str, Recording]:
     """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set.
 
-    `poses`: a CSV table without times is one of poses, and the efforts of a LeRobot data set are read.
+    `poses`: a CSV table without times is one of poses; with it or `efforts` those of a LeRobot data set are read.
     """
     stated = stated or AS_IT_IS
     folder, _, episode = str(path).rpartition("#")
     place = Path(folder) if episode.isdigit() and folder else Path(path)
     with memory_budget(place):
-        found = _loaded(place, stated, poses)
+        found = _loaded(place, stated, poses, efforts)
     if episode.isdigit() and folder:
         if str(path) not in found:
             raise BadInput(f"{path}: no such episode: {folder} has {len(found)} episodes, numbered from 0")
@@ -41,13 +43,13 @@ def load_recordings(path: str | Path, stated: Corrections | None = None, poses: 
     return {label: stated.apply(_chosen(r, stated, label), label).check(label) for label, r in found.items()}
 
 
-def _loaded(path: Path, stated: Corrections, poses: bool = False) -> dict[str, Recording]:
+def _loaded(path: Path, stated: Corrections, poses: bool = False, efforts: bool = False) -> dict[str, Recording]:
     """The recordings of a path as they stand in it, but for their columns' names."""
     if (path / "meta" / "info.json").is_file():
         require_extra(str(path), "parquet")
         from armlink.recording.lerobot import load_lerobot
 
-        return load_lerobot(path, efforts=poses)
+        return load_lerobot(path, efforts=poses or efforts)
     if (path / "metadata.yaml").is_file() or path.suffix in (".db3", ".bag"):
         require_extra(str(path), "bags")
         from armlink.recording.ros_bag import load_bag

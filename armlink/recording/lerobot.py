@@ -15,6 +15,7 @@ import pyarrow.compute as pa_compute
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
+from armlink.content.atomic_file import open_whole
 from armlink.content.file_content import MOST_TEXT, read_whole
 from armlink.errors import BadInput
 from armlink.recording.parquet import THREADS, has_lists, numbers, require_numbers
@@ -68,6 +69,16 @@ def load_lerobot(path: Path, efforts: bool = False) -> dict[str, Recording]:
             names=names,
         )
     return found
+
+
+def save_observations(path: Path, episodes: Array, t: Array, observations: dict[str, Array]) -> None:
+    """Write Parquet with the keys `observation.NAME`, values (K, m) of so many rows of a data set's episodes."""
+    columns = {"episode_index": pa.array(episodes.astype(np.int64)), "timestamp": pa.array(t.astype(np.float32))}
+    for name, values in observations.items():
+        flat = pa.array(values.astype(np.float32).ravel())
+        columns[f"observation.{name}"] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    with open_whole(path) as stream:
+        pa_parquet.write_table(pa.table(columns), stream, compression="zstd")
 
 
 def _features(path: Path) -> dict[str, Any]:

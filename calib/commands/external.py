@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from armlink.recording.recording import Recording
     from calib.external.arm_model import ArmRecords
     from calib.external.listening import Heard, WrenchFrame
+    from gcomp.arrays import Array
 
 
 @reads_recordings
@@ -36,7 +37,10 @@ def external(
     ] = None,
     false_alarms: Annotated[str, typer.Option(help="Allowed rate of false alarms: 1/h, 2/d.")] = "1/h",
     out: Annotated[
-        Path | None, typer.Option(help="Write torques, bounds and wrench over time: .csv, or .mcap for ROS 2.")
+        Path | None,
+        typer.Option(
+            help="Write torques, bounds and wrench over time: .csv, .mcap for ROS 2, or .parquet with LeRobot's keys."
+        ),
     ] = None,
     learned: Annotated[
         Path | None,
@@ -48,6 +52,10 @@ def external(
     bus: OtherBus = None,
     ros2: Ros2 = None,
     lerobot: LeRobot = None,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, metavar="PORT", help="While listening, serve to Foxglove; 0: a free port."),
+    ] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
@@ -101,7 +109,9 @@ def external(
     names = records.stated.arm.names
 
     def loaded(paths: list[str] | None) -> "dict[str, Recording]":
-        every = {label: each for path in paths or [] for label, each in load_recordings(path, stated).items()}
+        every = {
+            label: each for path in paths or [] for label, each in load_recordings(path, stated, efforts=True).items()
+        }
         return {label: in_joint_order(each, names, label) for label, each in every.items()}
 
     console, answers = results(json_file), list[dict[str, Any]]()
@@ -122,9 +132,9 @@ def external(
 
         if records.stated.arm_file is None:
             raise BadInput(f"{arm}: listening needs an arm file, which says how; `armlink new` makes one")
-        follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file)
+        follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file, foxglove)
         return
-    every: list[Heard] = []
+    every: list[tuple[str, Array, list[Heard]]] = []
     if not free and learned is None:
         recorded = records.gravity is not None or records.calibration is not None
         PlainConsole().print(
@@ -136,7 +146,7 @@ def external(
         heard = list(listen(listener, recording, place, per_hour))
         if not heard:
             raise BadInput(f"{label}: it has no {SHORTEST:g} s without missing rows, but needs them: record for longer")
-        every += heard
+        every.append((label, recording.t, heard))
         answers.append(answer_of(label, heard, names))
         _tell(console, answers[-1], names)
     if picture is not None:

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,10 +34,17 @@ LINE_SECONDS = 1.0
 """Between two lines on a pipe [s]."""
 
 
-def follow(arm: "ArmFile", source: str | None, learned: "Learned", seconds: float, json_file: Path | None) -> None:
+def follow(
+    arm: "ArmFile", source: str | None, learned: "Learned", seconds: float, json_file: Path | None, foxglove: int | None
+) -> None:
     """Tell until the time is over or Ctrl-C. Raises BusFault if nothing is heard, or no torque of the learned kind."""
     live, out = LiveExternal(learned), results(json_file)
-    with json_lines(json_file) as write, _shown(out) as show, contextlib.suppress(KeyboardInterrupt):
+    with (
+        json_lines(json_file) as write,
+        _served(arm, foxglove, out) as serve,
+        _shown(out) as show,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
         write(_header(live))
         rows, heard, first, shown, newest = 0, 0, 0.0, -np.inf, None
         for samples in heard_samples(arm, source, seconds, _channels(learned.listener.channel)):
@@ -51,6 +58,7 @@ def follow(arm: "ArmFile", source: str | None, learned: "Learned", seconds: floa
             if live.row is not None and live.row is not newest:
                 newest, rows = live.row, rows + 1
                 write(_line(live, newest, first))
+                serve(live, newest)
             now = time.monotonic()
             if newest is not None and now - shown >= (WAIT_SECONDS if out.is_terminal else LINE_SECONDS):
                 shown = now
@@ -100,6 +108,27 @@ def _wrench(live: LiveExternal) -> dict[str, list[float]]:
     told = live.wrench()
     assert told is not None
     return wrench_of(told)
+
+
+@contextlib.contextmanager
+def _served(
+    arm: "ArmFile", port: int | None, out: PlainConsole
+) -> "Iterator[Callable[[LiveExternal, ExternalRow], None]]":
+    """Where each row goes besides."""
+    if port is None:
+        yield lambda live, row: None
+        return
+    from armlink.monitor.streams import ExternalStream
+
+    with ExternalStream(arm.name, arm.joint_names, "base", port) as stream:
+        out.print(f"Foxglove: open ws://localhost:{stream.port}")
+
+        def send(live: LiveExternal, row: ExternalRow) -> None:
+            told = live.wrench()
+            assert told is not None
+            stream.send(row.external, row.std, told.value[0])
+
+        yield send
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from armlink.extras import require_extra
+from calib.external.even_samples import LONGEST_GAP
 from calib.external.listening import Heard
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactEvent
@@ -16,7 +17,7 @@ from gcomp.external.external_model import NORMAL_95
 from gcomp.external.wrench import Wrench
 
 AXES = ("x", "y", "z")
-SUFFIXES = (".csv", ".mcap")
+SUFFIXES = (".csv", ".mcap", ".parquet")
 REST_SPEED = 0.01
 """Speed of the fastest joint below which the arm rests [rad/s]."""
 NOT_FELT = 1e5
@@ -96,10 +97,18 @@ def require_writable(path: Path) -> None:
         raise BadInput(f"--out {path}: this suffix is not one of {', '.join(SUFFIXES)}")
     if path.suffix == ".mcap":
         require_extra("--out", "bags")
+    if path.suffix == ".parquet":
+        require_extra("--out", "parquet")
 
 
-def save_heard(path: Path, heard: Sequence[Heard], names: tuple[str, ...], frame_id: str) -> None:
-    """Write by suffix; `frame_id` names the frame whose axes a wrench is in."""
+def save_heard(
+    path: Path, judged: Sequence[tuple[str, Array, Sequence[Heard]]], names: tuple[str, ...], frame_id: str
+) -> None:
+    """Write by suffix; of each recording label, times and stretches; `frame_id` names the axes of a wrench."""
+    heard = [each for *_, stretches in judged for each in stretches]
+    if path.suffix == ".parquet":
+        _save_observations(path, judged)
+        return
     if path.suffix == ".csv":
         parts = [columns_of(each) for each in heard]
         table = np.column_stack([np.concatenate([part[name] for part in parts]) for name in parts[0]])
@@ -111,6 +120,32 @@ def save_heard(path: Path, heard: Sequence[Heard], names: tuple[str, ...], frame
     columns = ((each.t, each.judged.external, each.judged.std, each.wrench.value) for each in heard)
     t, external, std, value = (np.concatenate(column) for column in zip(*columns, strict=True))
     save_wrench_bag(path, t, names, external, std, frame_id, value)
+
+
+def _save_observations(path: Path, judged: Sequence[tuple[str, Array, Sequence[Heard]]]) -> None:
+    """As LeRobot's keys, at the rows of the recordings: what was known at their time."""
+    from armlink.recording.lerobot import save_observations
+
+    episodes, times, parts = list[Array](), list[Array](), list[dict[str, Array]]()
+    for number, (label, t, heard) in enumerate(judged):
+        episode = label.rpartition("#")[2]
+        episodes.append(np.full(len(t), int(episode) if "#" in label and episode.isdigit() else number))
+        times.append(t)
+        std = [np.sqrt(np.diagonal(each.wrench.covariance, axis1=1, axis2=2)) for each in heard]
+        rows = {
+            "external_torque": [each.judged.external for each in heard],
+            "external_torque_std": [each.judged.std for each in heard],
+            "external_wrench": [each.wrench.value for each in heard],
+            "external_wrench_std": [
+                np.where(each.wrench.determined, x, np.nan) for each, x in zip(heard, std, strict=True)
+            ],
+        }
+        known = np.concatenate([each.t for each in heard])
+        newest = np.searchsorted(known, t + 1e-6, side="right") - 1
+        fresh = (newest >= 0) & (t - known[newest] <= LONGEST_GAP)
+        parts.append({name: np.where(fresh[:, None], np.concatenate(x)[newest], np.nan) for name, x in rows.items()})
+    observations = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    save_observations(path, np.concatenate(episodes), np.concatenate(times), observations)
 
 
 def _listed(values: Array) -> list[float]:

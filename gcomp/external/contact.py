@@ -249,7 +249,7 @@ class ContactDetector:
         )  # fmt: skip
 
     def _end(self, opened: "_OpenEvent", event: ContactEvent, t: float) -> Iterator[ContactEvent]:
-        """Whether an event that no longer deviates was a contact that ended, and no load that this pose hardly shows.
+        """Whether an event that no longer deviates was a contact that ended, not a load that this pose hides.
 
         Odds are those of both changes, the one decided by and the one left, which is none after a contact.
         """

@@ -3,8 +3,11 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pa_parquet
 import pytest
 
 from armlink.arm_file import load_arm
@@ -95,6 +98,47 @@ def test_joints_of_a_recording_are_found_by_their_names(workplace, tmp_path, mon
     assert run([*words, "--json", "-"]) == 0
     one, other = json.loads(capsys.readouterr().out)["recordings"]
     assert other["rms"] == pytest.approx(one["rms"], rel=1e-3)
+
+
+def lerobot(folder: Path, episodes: list[Recording]) -> None:
+    """A data set of 30 rows a second, with efforts."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data").mkdir()
+    described = {"observation.state": {"names": ["j1.pos", "j2.pos", "j3.pos"]}, "observation.effort": {"shape": [3]}}
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 30, "features": described}))
+    columns: dict[str, list[Any]] = {name: [] for name in ("episode_index", "timestamp", "action", *described)}
+    for number, each in enumerate(episodes):
+        t = np.arange(0.0, each.t[-1], 1 / 30)
+        columns["timestamp"] += t.tolist()
+        columns["episode_index"] += [number] * len(t)
+        for names, values in (
+            (("observation.state", "action"), each.position),
+            (("observation.effort",), each.motor_torque),
+        ):
+            rows = np.stack([np.interp(t, each.t, column) for column in values.T], axis=1).tolist()
+            for name in names:
+                columns[name] += rows
+    pa_parquet.write_table(pa.table(columns), folder / "data" / "file-000.parquet")
+
+
+def test_a_lerobot_data_set_gets_observations(workplace, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    lerobot(tmp_path / "set", [recording(Path("arm.xml"), 2), recording(Path("arm.xml"), 3, 8.0)])
+    free = [word for k in range(1, 5) for word in ("--baseline", f"free_{k}.csv")]
+    words = ["external", "arm.xml", str(tmp_path / "set"), *free, "--out", str(tmp_path / "keys.parquet")]
+    assert run(words) == 0
+    table = pa_parquet.read_table(tmp_path / "keys.parquet")
+    rows = pa_parquet.read_table(tmp_path / "set" / "data" / "file-000.parquet")
+    assert table["episode_index"].to_pylist() == rows["episode_index"].to_pylist()
+    t, episode = np.array(table["timestamp"]), np.array(table["episode_index"])
+    assert t == pytest.approx(np.array(rows["timestamp"]), abs=1e-5)
+    torque = np.array(table["observation.external_torque"].to_pylist())
+    assert np.isfinite(torque[t > 0.1]).all()
+    middle = (t > 20.5) & (t < 20.9)
+    assert torque[middle & (episode == 1), 1] == pytest.approx(8.0, abs=1.5)
+    assert np.abs(torque[middle & (episode == 0), 1]).max() < 0.2
+    wrench = np.array(table["observation.external_wrench"].to_pylist())
+    assert wrench.shape == (len(t), 6)
 
 
 def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):

@@ -66,7 +66,9 @@ def test_a_push_is_told_while_the_arm_works(learned, monkeypatch, capsys, tmp_pa
     messages.sleep_until(fast.t)
     bus = ListeningBus(messages, "ros2:/joint_states", fast.file.joint_names, rate=50.0, clock=messages)
     monkeypatch.setattr(bus_open, "open_listening_bus", lambda *given: bus)
-    status, (header, *lines), said = followed(["--ros2", "/joint_states", "--seconds", "30", *known], capsys)
+    status, (header, *lines), said = followed(
+        ["--ros2", "/joint_states", "--seconds", "30", "--foxglove", "0", *known], capsys
+    )
     assert status == 0
     assert header["schema"] == "armlink.external-live/1"
     rows = [line for line in lines if "event" not in line]
@@ -79,19 +81,26 @@ def test_a_push_is_told_while_the_arm_works(learned, monkeypatch, capsys, tmp_pa
     assert {"force", "force_std", "moment", "moment_std", "load"} <= set(rows[0])
     assert f"{last['t']:9.2f} s  {last['kind']}" in said
     assert "± " in said
+    assert "Foxglove: open ws://localhost:" in said
     assert "force at joint_7: x" in said
 
 
-def test_no_frame_leaves_on_a_real_bus(learned, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("interface", "channel"), [("udp_multicast", GROUP), pytest.param("socketcan", "vcan0", marks=pytest.mark.vcan)]
+)
+def test_no_frame_leaves_on_a_real_bus(learned, monkeypatch, capsys, interface, channel):
     fast, known = learned
-    port = 45300 + os.getpid() % 1000
-    monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": port}))
+    multicast = interface == "udp_multicast"
+    options = {"port": 45300 + os.getpid() % 1000} if multicast else {"receive_own_messages": True}
+    if not multicast and not Path("/sys/class/net/vcan0").exists():
+        pytest.skip("needs a SocketCAN interface vcan0: run it with scripts/with-vcan .venv/bin/pytest -m vcan")
+    monkeypatch.setenv("CAN_CONFIG", json.dumps(options if multicast else {}))
     over, sent, seen = threading.Event(), Counter[tuple[int, bytes]](), Counter[tuple[int, bytes]]()
 
     def host() -> None:
         """Readings of an arm at rest, which something pushes after 2 s."""
         q, cycle = fast.q, 0
-        with can.Bus(GROUP, interface="udp_multicast", port=port) as bus:
+        with can.Bus(channel, interface=interface, **options) as bus:
             while not over.is_set():
                 fast.push = push if cycle > 100 else None
                 torque = fast.read(q[None], 0.0 * q[None])[0]
@@ -102,7 +111,7 @@ def test_no_frame_leaves_on_a_real_bus(learned, monkeypatch, capsys):
                 for number, data in frames:
                     bus.send(can.Message(arbitration_id=number, data=data, is_extended_id=False))
                     sent[number, data] += 1
-                while (message := bus.recv(0.0)) is not None:  # a group hears its own frames, too
+                while (message := bus.recv(0.0)) is not None:  # its own frames, too
                     seen[message.arbitration_id, bytes(message.data)] += 1
                 cycle += 1
                 time.sleep(0.02)
@@ -111,7 +120,7 @@ def test_no_frame_leaves_on_a_real_bus(learned, monkeypatch, capsys):
     thread = threading.Thread(target=host)
     thread.start()
     try:
-        status, (_, *lines), _ = followed(["--bus", f"udp_multicast:{GROUP}", "--seconds", "5", *known], capsys)
+        status, (_, *lines), _ = followed(["--bus", f"{interface}:{channel}", "--seconds", "5", *known], capsys)
     finally:
         over.set()
         thread.join()
