@@ -139,7 +139,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
         rows.append(cells)
     console.print(table)
     if short != list(arm.joint_names):
-        columns = (f"{number} {name}" for number, name in zip(short, arm.joint_names, strict=True))
+        columns = (f"{number}\u00a0{name}" for number, name in zip(short, arm.joint_names, strict=True))
         console.print(f"columns: {', '.join(columns)}")
     signs, pressed = {cell[0] for cells in rows for cell in cells}, any(sweep.bias for sweep in plan.sweeps)
     legend = ["Γ/g is the share of gravity that acts on the joint", "↔ sweeps"]

@@ -227,3 +227,14 @@ def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path, words):
     assert done.returncode == 3
     assert "cannot open it" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_new_does_not_ask_to_replace_a_file_by_a_model_that_is_not_there(tmp_path):
+    (tmp_path / "arm.yaml").write_text("name: arm\n")
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "armlink.cli", "new", "arm.urdf"]
+    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+    os.close(master)
+    os.close(slave)
+    assert done.returncode == 2
+    assert done.stderr == "armlink: there is no model file arm.urdf: give the path of a URDF or MJCF file\n"

@@ -132,6 +132,10 @@ def new(
         suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
         raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
     out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
+    if is_arm_file:
+        load_arm(bundled or model)
+    elif not model.is_file():  # before anything is asked
+        raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
     if is_xacro:
         model = expanded(model, out.with_suffix(".urdf"))
