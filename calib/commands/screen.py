@@ -173,7 +173,8 @@ def stall_lines(data: "SweepData") -> list[str]:
     if not data.stalls:
         return []
     places = list(dict.fromkeys(_place(stall.reading) for stall in data.stalls))
-    return [f"the joints were stopped {len(data.stalls)} times, and these readings were repeated: {', '.join(places)}"]
+    often = "once" if len(data.stalls) == 1 else f"{len(data.stalls)} times"
+    return [f"the joints were stopped {often}, and this was repeated: {'; '.join(places)}"]
 
 
 def _place(reading: str) -> str:
