@@ -93,15 +93,15 @@ class SweepScreen:
         self._progress.stop()
 
 
-def confirm(motion: str, question: str) -> None:
+def confirm(motion: str, question: str) -> list[str]:
     """Say what will move and ask a person at the terminal; raises Declined where the answer is no.
 
-    Without a terminal nobody is asked, and a line says so.
+    Without a terminal nobody is asked: the lines that say so, for the moment before it moves.
     """
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(f"{motion}. {question}")
-    else:
-        _CONSOLE.print(f"{motion}. {question} Without a terminal nobody is asked, and it moves now")
+        return []
+    return [f"{motion}. {question} Without a terminal nobody is asked, and it moves now"]
 
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
