@@ -41,17 +41,21 @@ def hold_afloat(
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
     from calib.arm.tool import with_tool
-    from calib.commands.screen import confirm, warn_late
+    from calib.commands.screen import confirm, print_lines, warn_late
     from calib.floating.run import run_float
 
     arm_file = with_tool(load_arm(arm), tool)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
-    if not yes:
-        confirm(f"{arm_file.name} will be held by its gravity model alone", "Do you hold it with your hand?")
+    unasked = (
+        []
+        if yes
+        else confirm(f"{arm_file.name} will be held by its gravity model alone", "Do you hold it with your hand?")
+    )
     resume = command_line("float", arm, bus=bus, record=record, tool=tool, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
+        print_lines(unasked)
         work.enabled = True
         link.enable()
         screen.print(f"{arm_file.name} floats by {source}; end with Ctrl-C")

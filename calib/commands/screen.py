@@ -93,15 +93,15 @@ class SweepScreen:
         self._progress.stop()
 
 
-def confirm(motion: str, question: str) -> None:
+def confirm(motion: str, question: str) -> list[str]:
     """Say what will move and ask a person at the terminal; raises Declined where the answer is no.
 
-    Without a terminal nobody is asked, and a line says so.
+    Without a terminal nobody is asked: the lines that say so, for the moment before it moves.
     """
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(f"{motion}. {question}")
-    else:
-        _CONSOLE.print(f"{motion}. {question} Without a terminal nobody is asked, and it moves now")
+        return []
+    return [f"{motion}. {question} Without a terminal nobody is asked, and it moves now"]
 
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
@@ -139,7 +139,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
         rows.append(cells)
     console.print(table)
     if short != list(arm.joint_names):
-        columns = (f"{number} {name}" for number, name in zip(short, arm.joint_names, strict=True))
+        columns = (f"{number}\u00a0{name}" for number, name in zip(short, arm.joint_names, strict=True))
         console.print(f"columns: {', '.join(columns)}")
     signs, pressed = {cell[0] for cells in rows for cell in cells}, any(sweep.bias for sweep in plan.sweeps)
     legend = ["Γ/g is the share of gravity that acts on the joint", "↔ sweeps"]
@@ -173,7 +173,8 @@ def stall_lines(data: "SweepData") -> list[str]:
     if not data.stalls:
         return []
     places = list(dict.fromkeys(_place(stall.reading) for stall in data.stalls))
-    return [f"the joints were stopped {len(data.stalls)} times, and these readings were repeated: {', '.join(places)}"]
+    often = "once" if len(data.stalls) == 1 else f"{len(data.stalls)} times"
+    return [f"the joints were stopped {often}, and this was repeated: {'; '.join(places)}"]
 
 
 def _place(reading: str) -> str:

@@ -73,7 +73,7 @@ def sweep(
     from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, warn_late
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines, warn_late
     from calib.commissioning.model_checks import refuse_impossible_sweep
     from calib.dataset import MANIFEST, new_folder, require_vacant
 
@@ -99,8 +99,11 @@ def sweep(
     if out is None:
         raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")
     require_vacant(out, resume)
-    if not dry_run and not yes:
-        confirm(f"{arm_file.name} will move through its whole range, {_load(reference_mass)}", SPACE_CLEAR)
+    unasked = (
+        []
+        if dry_run or yes
+        else confirm(f"{arm_file.name} will move through its whole range, {_load(reference_mass)}", SPACE_CLEAR)
+    )
     load = reference_mass if dry_run else 0.0
 
     def going_on() -> str:
@@ -110,6 +113,7 @@ def sweep(
     opened = open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load)
     with early_end(arm_file, going_on) as work, opened as link:
         link.start()
+        print_lines(unasked)
         work.enabled = True
         with SweepScreen(f"{arm_file.name}, {_load(reference_mass)}") as screen:
             found, data = _run(

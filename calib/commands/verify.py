@@ -43,15 +43,14 @@ def verify(
     from armlink.loop.open import open_arm
     from calib.arm.sweep_section import sweep_motion
     from calib.arm.tool import with_tool
-    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
     if report is not None:
         require_extra("--report", "reports")
     arm_file = with_tool(load_arm(arm), tool)
-    if not yes:
-        confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR)
+    unasked = [] if yes else confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR)
     with (
         early_end(arm_file, command_line("verify", arm, bus=bus, tool=tool, store=store)) as work,
         open_arm(arm_file, bus) as link,
@@ -60,6 +59,7 @@ def verify(
         if calibration is None and sweep_motion(arm_file) == "creep":
             raise no_record(arm_file, "calibration")
         link.start()
+        print_lines(unasked)
         work.enabled = True
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()

@@ -33,20 +33,24 @@ def weigh(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results
     from armlink.loop.open import open_arm
-    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
     from calib.sweep.weigh import run_weigh
 
     arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
     gravity, calibration = records.required(GravityRecord, arm_file), records.required(CalibrationRecord, arm_file)
-    if not yes:
-        confirm(f"{arm_file.name} will drive to {poses} poses all over its range, with its load", SPACE_CLEAR)
+    unasked = (
+        []
+        if yes
+        else confirm(f"{arm_file.name} will drive to {poses} poses all over its range, with its load", SPACE_CLEAR)
+    )
     with (
         early_end(arm_file, command_line("weigh", arm, bus=bus, store=store)) as work,
         open_arm(arm_file, bus) as link,
     ):
         link.start()
+        print_lines(unasked)
         work.enabled = True
         with SweepScreen(f"{arm_file.name}: weigh") as screen:
             link.enable()

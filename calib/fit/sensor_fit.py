@@ -41,8 +41,8 @@ def mass_complaint(arm: Arm, readings: StaticReadings) -> str | None:
     if felt is None or LEAST <= felt / stated <= MOST:
         return None
     return (
-        f"the loaded pass shows {felt:.1f} kg, but --reference-mass was {stated:g} kg: was the "
-        "mass attached, and is the number right?"
+        f"the loaded pass shows {felt:.1f} kg, but --reference-mass was {stated:g} kg: attach the mass, or give its "
+        "right number, and sweep again."
     )
 
 

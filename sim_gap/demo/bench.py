@@ -85,7 +85,7 @@ class Bench:
         self.travel(link.position_sent, targets[0])
         for k, target in enumerate(targets):
             rows.append(link.cycle(Command.hold(target)))
-            progress(k + 1, len(targets), f"cycles, {path.stem}")
+            progress(k + 1, len(targets), f"cycles of the recording {path.stem}")
         recording = Recording(
             t=np.array([row.t for row in rows]) - rows[0].t,
             position=calibration.angle(np.array([row.position for row in rows])),

@@ -15,6 +15,7 @@ import pytest
 from wrong_arms import THREE, Wrong, model, record
 
 from armlink import cli
+from armlink.arm_file import bundled_arms
 from armlink.recording.files import save_recording
 
 ROOT = Path(__file__).parents[2]
@@ -213,14 +214,27 @@ def test_new_names_joints_that_are_set_aside_for_one_reason_in_one_line(tmp_path
     assert said == ["2 joints are not part of the arm, since each is prismatic: slide_l, slide_r"]
 
 
-def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path):
+@pytest.mark.parametrize("words", [["arm.urdf"], ["mine.yaml", "--force", "--by-hand"], ["--out", "other.yaml"]])
+def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path, words):
     """Answers would be lost. The bus is looked at first, on a terminal as on a pipe."""
     shutil.copy(folder / "arm.urdf", tmp_path)
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "armlink.cli", "new", "arm.urdf", "--bus", "socketcan:no_such_bus"]
+    shutil.copy(bundled_arms()["sarcos"], tmp_path / "mine.yaml")
+    command = [sys.executable, "-m", "armlink.cli", "new", *words, "--bus", "socketcan:no_such_bus"]
     done = subprocess.run(command, stdin=slave, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
     os.close(master)
     os.close(slave)
     assert done.returncode == 3
     assert "cannot open it" in done.stderr
-    assert "or Enter" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_new_does_not_ask_to_replace_a_file_by_a_model_that_is_not_there(tmp_path):
+    (tmp_path / "arm.yaml").write_text("name: arm\n")
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "armlink.cli", "new", "arm.urdf"]
+    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+    os.close(master)
+    os.close(slave)
+    assert done.returncode == 2
+    assert done.stderr == "armlink: there is no model file arm.urdf: give the path of a URDF or MJCF file\n"

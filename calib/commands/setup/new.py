@@ -10,6 +10,7 @@ from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
+    from calib.commissioning.drive_match import Ask
     from calib.commissioning.new_arm import NewArm
 
 
@@ -116,7 +117,7 @@ def new(
             )
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
-        return begin_with_drives(out, bus, name, hand(by_hand, interactive), json_file)
+        return begin_with_drives(out, bus, name, _hand(bus, by_hand, interactive), json_file)
     bundled = bundled_arms().get(str(model))
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
@@ -131,13 +132,17 @@ def new(
         suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
         raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
     out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
+    if is_arm_file:
+        load_arm(bundled or model)
+    elif not model.is_file():  # before anything is asked
+        raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
     if is_xacro:
         model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
         found, is_bundled = bundled or model, bundled is not None
         by_ids = not by_hand and drives_have_ids(load_arm(found))
-        ask = None if by_ids else hand(by_hand, interactive)
+        ask = None if by_ids else _hand(str(bus), by_hand, interactive)
         return rewire(found, out, str(bus), ask, by_ids=by_ids, bundled=is_bundled, json=json_file)
     if bus is not None:
         open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
@@ -169,6 +174,15 @@ def new(
     suggest(step)
     write_json(json_file, _answer(made, arm, step))
     return exit_status(made.findings)
+
+
+def _hand(bus: str, by_hand: bool | None, interactive: bool) -> "Ask | None":
+    """How a person is asked to turn a joint, on a bus that is there: answers are not lost to another."""
+    from calib.commands.setup.bus_setup import open_named
+    from calib.commands.setup.terminal import hand
+
+    open_named(bus).shutdown()
+    return hand(by_hand, interactive)
 
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:

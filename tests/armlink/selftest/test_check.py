@@ -308,7 +308,7 @@ def test_a_drive_that_lost_a_turn_fails_without_power(tmp_path, capsys, drive, p
         ({"a": 0.008, "b": 0.012, "c": 0.0081}, "8 to 12 ms"),
         ({"a": 0.008, "b": 0.0081}, "8 ms"),
         ({"a": 0.008, "b": "passed"}, "8 ms: a; ok: b"),
-        ({"a": "passed", "b": "failed", "c": "passed", "d": "not run"}, "ok: a, c; FAILED: b; –: d"),
+        ({"a": "passed", "b": "failed", "c": "passed", "d": "not run"}, "ok: a, c; FAILED: b; not made: d"),
     ],
 )
 def test_the_table_names_joints_where_they_differ(found, shown):
