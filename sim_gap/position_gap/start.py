@@ -12,6 +12,7 @@ from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, Progress, costs_of, worth
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
+from sim_gap.position_gap.plant import nominal_point
 from sim_gap.position_gap.windows import Windows, thin
 
 GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
@@ -48,7 +49,7 @@ LEAST_FLOOR = 1e-5
 
 def scales_of(data: Windows) -> Scales:
     """Natural sizes of each joint along the recordings."""
-    arm = data.plant.sim.arm
+    arm, nominal = data.plant.sim.arm, nominal_point(data.plant)
     weight = data.weight
     count = np.maximum(weight.sum((0, 2)), 1.0)
 
@@ -65,7 +66,10 @@ def scales_of(data: Windows) -> Scales:
     torque = np.maximum(rms(data.torque), 1e-6)
     served = np.maximum((data.served * weight).sum((0, 2)), 1.0)
     error = np.sqrt((data.served * weight * data.error**2).sum((0, 2)) / served)
-    return Scales(torque, torque / np.maximum(rms(data.v), 0.05), inertia, np.maximum(error, 1e-4))
+    # what the model has is in doubt by its own size, however little the links ask for
+    friction = np.maximum(torque, nominal["coulomb"])
+    damping = np.maximum(torque / np.maximum(rms(data.v), 0.05), nominal["viscous"])
+    return Scales(torque, friction, damping, inertia, np.maximum(error, 1e-4))
 
 
 def noise_floor(data: Windows) -> Array:
