@@ -19,7 +19,7 @@ class LoopParameter:
     low: float = 0.0
     high: float = np.inf
     scale: str = "1"
-    """`torque` (RMS torque of the joint), `damping`, `inertia`, `angle` (RMS of the error), `stiffness` or `1`."""
+    """`torque` (RMS torque of the joint), `angle` (RMS of the error), another quantity of `Scales`, `stiffness` or `1`."""
     spread: float = 10.0
     """Standard deviation before any recording, in units of the size at which it is tried."""
 
@@ -108,16 +108,12 @@ class Scales:
     inertia: Array
     angle: Array
 
-    @property
-    def stiffness(self) -> Array:
-        """Torque over the error under which a servo makes it [N·m/rad]: a spring is felt beside the servo's gain."""
-        return np.asarray(self.torque / self.angle)
-
     def of(self, name: str) -> Array:
         """Size at which a parameter is tried, (J,)."""
         parameter = PARAMETERS[name]
-        one = np.ones_like(self.torque)
-        return np.asarray(parameter.trial * (one if parameter.scale == "1" else getattr(self, parameter.scale)))
+        # a spring is felt beside the servo, which makes its torque under its error
+        own = {"1": np.ones_like(self.torque), "stiffness": self.torque / self.angle}
+        return np.asarray(parameter.trial * (own | vars(self))[parameter.scale])
 
 
 LOGARITHMIC = ("kp", "stribeck_velocity", "gain")

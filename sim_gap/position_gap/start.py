@@ -49,8 +49,7 @@ LEAST_FLOOR = 1e-5
 
 def scales_of(data: Windows) -> Scales:
     """Natural sizes of each joint along the recordings."""
-    arm, nominal = data.plant.sim.arm, nominal_point(data.plant)
-    weight = data.weight
+    arm, weight, nominal = data.plant.sim.arm, data.weight, nominal_point(data.plant)
     count = np.maximum(weight.sum((0, 2)), 1.0)
 
     def rms(values: Array) -> Array:
