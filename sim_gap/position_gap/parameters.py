@@ -19,7 +19,7 @@ class LoopParameter:
     low: float = 0.0
     high: float = np.inf
     scale: str = "1"
-    """`torque` (RMS torque of the joint), `angle` (RMS of the error), another quantity of `Scales`, `stiffness` or `1`."""
+    """A quantity of `Scales`, `stiffness` (of the servo, about) or `1`."""
     spread: float = 10.0
     """Standard deviation before any recording, in units of the size at which it is tried."""
 
