@@ -93,12 +93,12 @@ def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, Lo
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
-    names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
     swings = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2))
     moving = np.flatnonzero(~at_rest).tolist()
-    free = [(j, name) for j in moving for name in (*names, *(("armature",) if swings[j] else ()))]
-    search = replace(search, kept=frozenset(() if complete else ("controller.stiffness",)))
+    free = [(j, name) for j in moving for name in ("kp", "viscous", "coulomb", *(("armature",) if swings[j] else ()))]
+    kept = "friction.coulomb", "friction.viscous", "controller.stiffness"
+    search = replace(search, kept=frozenset(kept[: 2 if complete else 3]))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
     fit = few.improve(LoopFit(point, tuple(free)), 5, NORMAL)
