@@ -17,9 +17,6 @@ from sim_gap.position_gap.windows import Windows, thin
 
 FOLDS = 6
 """Parts of the windows of which each is held out once."""
-LEAST_FALL = 0.025
-"""Least relative fall of a joint's RMS by an effect: half of what makes a cause (`judge.LEAST_SHRINK`), which may come
-as two effects at first."""
 OF_EVERY_JOINT = "friction.coulomb", "friction.viscous", "actuator.rotor_inertia"
 """Effects that every joint has, of which a model states a guess: they pay no price."""
 QUIET = 1.1
@@ -138,19 +135,16 @@ def look_about(
     problem = layout.problem(steps)
     about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
-    samples = search.samples
     effects: dict[Group, Effect[Group]] = {}
     for group in listed:
         effect, joints = group
         numbers = tuple(at[place] for place in search.places_of(group) if place in at)
-        least = LEAST_FALL * float(samples[list(joints)].mean() if joints else samples.mean())
         needs = tuple(
             (need, joints)
             for need in (EFFECTS[effect].needs if joints else ())
             if not active_in(search.nominal, need, joints[0])
         )
-        price = 0.0 if effect in OF_EVERY_JOINT else None
-        effects[group] = Effect(group, numbers, needs, least, price)
+        effects[group] = Effect(group, numbers, needs, price=0.0 if effect in OF_EVERY_JOINT else None)
     return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
 
 
@@ -193,20 +187,12 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
             found = [*names, *(name for name in found if name not in names)]
             made = search.improve(entered(search, about.moved(found)), FITTING)
             reached = worth(search, made)
-        same, names, fit = set(found) == set(names), found, made
         if reached >= most:
             best, most = made, reached
-        if same:
+        if set(found) == set(names):
             break
-    if not same or best is not fit:
-        fit, names = best, chosen_of(search, best)
-        about = look_about(search, fit, looked, levels)
-    found = choose(about.terms, [about.effects[n] for n in names], names, kept)
-    if set(found) != set(names):
-        made = search.improve(about.moved(found), 4)
-        if worth(search, made) >= most:
-            fit = made
-    return fit
+        names, fit = found, made
+    return best
 
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
@@ -219,9 +205,18 @@ def worth(search: LoopSearch, fit: LoopFit) -> float:
 
 def costs_of(search: LoopSearch, points: Sequence[Point]) -> Array:
     """Negative logarithm of the likelihood of each joint at P points, (P, J), but for a constant."""
-    problem = Layout(search, points[0], ()).problem()
-    left = residuals(search.data, points).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
+    problem, left = Layout(search, points[0], ()).problem(), _by_joint(search, points)
     return np.stack([cost_of(problem, each, scale_of(problem, each)) for each in left])
+
+
+def scale_left(search: LoopSearch, point: Point) -> Array:
+    """Scale of the residuals beyond the noise, in which moments of contact count little, (J,) [rad]."""
+    scale = scale_of(Layout(search, point, ()).problem(), _by_joint(search, [point])[0])
+    return np.asarray(np.sqrt(scale - search.floor**2))
+
+
+def _by_joint(search: LoopSearch, points: Sequence[Point]) -> Array:
+    return residuals(search.data, points).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[Group]:

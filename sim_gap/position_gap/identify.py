@@ -17,6 +17,7 @@ from sim_gap.position_gap.choice import (
     About,
     groups_of,
     look_about,
+    scale_left,
     select,
     without_group,
     worth,
@@ -164,14 +165,13 @@ def identify(
 
 def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
     """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
-    before = rms_on(search.data, search.nominal)
-    if complete and bool(np.all(before < QUIET * search.floor)):
+    if complete and bool(np.all(rms_on(search.data, search.nominal) < QUIET * search.floor)):
         bare = LoopFit(search.nominal)
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, progress)
     best = select(search, fit, progress)
-    left = rms_on(search.data, best.point)
-    unexplained = left > np.maximum(EXPLAINED * before, QUIET * search.floor)
+    left, gap = (scale_left(search, point) for point in (best.point, search.nominal))
+    unexplained = left > np.maximum(EXPLAINED * gap, QUIET * search.floor)
     unexplained &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
     if complete and unexplained.any():
         progress("fitting servos with limits as a start")

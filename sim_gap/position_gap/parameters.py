@@ -19,7 +19,7 @@ class LoopParameter:
     low: float = 0.0
     high: float = np.inf
     scale: str = "1"
-    """`torque` (RMS torque of the joint), `damping`, `inertia`, `angle` (RMS of the error) or `1`."""
+    """A quantity of `Scales`, `stiffness` (of the servo, about) or `1`."""
     spread: float = 10.0
     """Standard deviation before any recording, in units of the size at which it is tried."""
 
@@ -36,17 +36,17 @@ PARAMETERS = {
         LoopParameter("slew", "rad/s", np.inf, 1.0, 0.02),
         LoopParameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
         LoopParameter("limit", "N·m", np.inf, 1.0, 1e-3, np.inf, "torque"),
-        LoopParameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        LoopParameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "friction"),
         LoopParameter("viscous", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
         LoopParameter("back_emf", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
-        LoopParameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        LoopParameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "friction"),
         LoopParameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
         LoopParameter("creep", "rad/s", 0.0, 0.02, 0.0, 0.5),
         # gears lose a tenth to two fifths of the torque that they carry (Harmonic Drive's efficiency charts)
         LoopParameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0, spread=2.0),
         LoopParameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
         LoopParameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
-        LoopParameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),
+        LoopParameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "stiffness"),
         LoopParameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
         LoopParameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
     )
@@ -100,9 +100,10 @@ EFFECTS = {
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Natural sizes of each joint, (J,): torque [N·m], damping [N·m·s/rad], inertia [kg·m²], error [rad]."""
+    """Natural sizes of each joint, (J,): torque, friction [N·m], damping [N·m·s/rad], inertia [kg·m²], error [rad]."""
 
     torque: Array
+    friction: Array
     damping: Array
     inertia: Array
     angle: Array
@@ -110,8 +111,9 @@ class Scales:
     def of(self, name: str) -> Array:
         """Size at which a parameter is tried, (J,)."""
         parameter = PARAMETERS[name]
-        one = np.ones_like(self.torque)
-        return np.asarray(parameter.trial * (one if parameter.scale == "1" else getattr(self, parameter.scale)))
+        # a spring is felt beside the servo, which makes its torque under its error
+        own = {"1": np.ones_like(self.torque), "stiffness": self.torque / self.angle}
+        return np.asarray(parameter.trial * (own | vars(self))[parameter.scale])
 
 
 LOGARITHMIC = ("kp", "stribeck_velocity", "gain")

@@ -12,6 +12,7 @@ from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, Progress, costs_of, worth
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
+from sim_gap.position_gap.plant import nominal_point
 from sim_gap.position_gap.windows import Windows, thin
 
 GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
@@ -48,8 +49,7 @@ LEAST_FLOOR = 1e-5
 
 def scales_of(data: Windows) -> Scales:
     """Natural sizes of each joint along the recordings."""
-    arm = data.plant.sim.arm
-    weight = data.weight
+    arm, weight, nominal = data.plant.sim.arm, data.weight, nominal_point(data.plant)
     count = np.maximum(weight.sum((0, 2)), 1.0)
 
     def rms(values: Array) -> Array:
@@ -65,7 +65,10 @@ def scales_of(data: Windows) -> Scales:
     torque = np.maximum(rms(data.torque), 1e-6)
     served = np.maximum((data.served * weight).sum((0, 2)), 1.0)
     error = np.sqrt((data.served * weight * data.error**2).sum((0, 2)) / served)
-    return Scales(torque, torque / np.maximum(rms(data.v), 0.05), inertia, np.maximum(error, 1e-4))
+    # what the model has is in doubt by its own size, however little the links ask for
+    friction = np.maximum(torque, nominal["coulomb"])
+    damping = np.maximum(torque / np.maximum(rms(data.v), 0.05), nominal["viscous"])
+    return Scales(torque, friction, damping, inertia, np.maximum(error, 1e-4))
 
 
 def noise_floor(data: Windows) -> Array:
@@ -90,12 +93,12 @@ def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, Lo
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
-    names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
     swings = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2))
     moving = np.flatnonzero(~at_rest).tolist()
-    free = [(j, name) for j in moving for name in (*names, *(("armature",) if swings[j] else ()))]
-    search = replace(search, kept=frozenset(() if complete else ("controller.stiffness",)))
+    free = [(j, name) for j in moving for name in ("kp", "viscous", "coulomb", *(("armature",) if swings[j] else ()))]
+    kept = "friction.coulomb", "friction.viscous", "controller.stiffness"
+    search = replace(search, kept=frozenset(kept[: 2 if complete else 3]))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
     fit = few.improve(LoopFit(point, tuple(free)), 5, NORMAL)

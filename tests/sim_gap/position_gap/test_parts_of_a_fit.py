@@ -55,7 +55,7 @@ def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_ma
     monkeypatch.setattr(spread, "rms_on", lambda data, point: np.array([0.001, 0.0, 0.01]))
     fit = LoopFit({"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])})
     torque, one = np.full(3, 0.5), np.ones(3)
-    scales = Scales(torque, one, one, np.full(3, 0.02))
+    scales = Scales(torque, torque, one, one, np.full(3, 0.02))
     search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True, joints=3), scales=scales)
     share = 0.05 * spread.OTHERWISE
     found = spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")])
@@ -162,9 +162,29 @@ def test_a_limit_is_tried_at_the_level_that_fits() -> None:
     assert level[0] == pytest.approx(0.45, rel=0.4)
 
 
+def test_a_spring_is_found_beside_a_servo_that_is_much_stronger_than_the_links_are_heavy() -> None:
+    text = model_text(kp=400.0, friction=0.0, damping=8.0)
+    sprung = text.replace('name="shoulder" axis', 'name="shoulder" stiffness="25" axis')
+    search = search_on(text, [record(sprung, 2, 14.0)])
+    fit = search.improve(LoopFit(search.nominal).freed([(0, "spring"), (0, "offset")]))
+    assert fit.point["spring"][0] == pytest.approx(25.0, rel=0.03)
+    assert fit.point["offset"][0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_friction_of_a_model_is_in_doubt_by_its_own_size_where_links_ask_for_little() -> None:
+    light = {'mass="0.6"': 'mass="0.006"', 'mass="0.3"': 'mass="0.003"'}
+    stated, true = (model_text(kp=15.0, friction=dry, damping=damping) for dry, damping in ((0.3, 3.0), (0.1, 1.0)))
+    for old, new in light.items():
+        stated, true = stated.replace(old, new), true.replace(old, new)
+    search = search_on(stated, [record(true, 2, 14.0)])
+    fit = search.improve(LoopFit(search.nominal).freed(at_both("coulomb", "viscous")))
+    np.testing.assert_allclose(fit.point["viscous"], 1.0, rtol=0.05)
+    np.testing.assert_allclose(fit.point["coulomb"], 0.1, rtol=0.1)
+
+
 def moved(name: str, value: float, step: float) -> float:
     """A parameter's value after a step in its own coordinate, where all sizes are 1."""
-    size = float(Scales(*np.ones((4, 1))).of(name)[0])
+    size = float(Scales(*np.ones((5, 1))).of(name)[0])
     return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
 
 
