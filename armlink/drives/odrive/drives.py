@@ -354,7 +354,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     """By the heartbeats heard; another device hardly sends nothing but CANSimple on its identifiers."""
     known, beats, others = sum(AxisError), dict[int, list[bool]](), set[int]()
     for can_id, data in bus.heard:
-        if can_id <= 0x7FF and can_id & 0x1F not in iter(Message):
+        if can_id <= 0x7FF and can_id & 0x1F not in {*map(int, Message)}:
             others.add(can_id >> 5)
         elif can_id <= 0x7FF and can_id & 0x1F == Message.HEARTBEAT:
             beat = frames.heartbeat(data)
