@@ -137,6 +137,7 @@ NAMED = {
         ("--report", ["gap", "diagnose", "--sim", "s.xml", "--train", "t.csv", "--report", "r.html"]),
     ],
     "rerun": [("--rerun", ["monitor", "sarcos", "--bus", "virtual:x", "--rerun", "1"])],
+    "ros2": [("bus ros2:/joint_states", ["monitor", "sarcos", "--once", "--ros2", "/joint_states"])],
     "simulator": [("bus udp_multicast:239.0.0.1", ["scan", "--bus", "udp_multicast:239.0.0.1"])],
 }
 """Extra → commands that need it, with the purpose that their error begins with."""
