@@ -106,11 +106,18 @@ class EncoderFault(Refused):
 class EncoderCheck:
     """Sees every sample, and at the end of each motion what was read on the way."""
 
-    def __init__(self, names: tuple[str, ...], step: Array, speed: Array, now: float) -> None:
-        """Of n joints whose readings change by at least `step` [rad], and that turn at most at `speed` [rad/s]."""
+    def __init__(self, names: tuple[str, ...], step: Array, speed: Array, now: float, own_clock: Mask) -> None:
+        """Of n joints whose readings change by at least `step` [rad], and that turn at most at `speed` [rad/s].
+
+        `own_clock` (n,): whose drives send without being asked. What such a drive sent may have waited on its way for
+        as long as nothing came before it.
+        """
         self._names, self._step = names, step
         self._fastest, self._slack = JUMP * speed, JUMP_STEPS * step
+        self._own_clock = own_clock
         self._read_at = np.full(len(names), now)
+        self._read_before = self._read_at.copy()
+        """Times of the last reading of each joint and of the one before it [s]."""
         self._delay = 0.0
         self._unsure = np.zeros(len(names), dtype=bool)
         """Whether the last reading of each joint was not timely: nothing is said of the way from there."""
@@ -126,7 +133,8 @@ class EncoderCheck:
         if sample.timely is not None:
             self._unsure |= ~sample.timely
         moved = sample.position - before
-        elapsed = sample.t - self._read_at + max(sample.delay, self._delay)
+        taken = np.where(self._own_clock, self._read_before, self._read_at)
+        elapsed = sample.t - taken + max(sample.delay, self._delay)
         jumped = (np.abs(moved) > self._fastest * elapsed + self._slack) & ~self._unsure
         self._delay = sample.delay
         if np.count_nonzero(jumped):  # never of a reading that did not come: NaN
@@ -137,6 +145,7 @@ class EncoderCheck:
             )
             raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
         came = np.isfinite(sample.position)
+        np.copyto(self._read_before, self._read_at, where=came)
         np.copyto(self._read_at, sample.t, where=came)
         self._unsure &= ~(came if sample.timely is None else came & sample.timely)
 

@@ -73,6 +73,7 @@ class Mover:
     def __init__(self, link: ArmDriver, section: SweepSection, limits: DriveLimits) -> None:
         """Take over an enabled link: every joint is held at its last target."""
         self.link, self.section, self.limits = link, section, limits
+        self._traits = traits_of(make_groups(link.arm))
         self.average_to(section.standard_error)
         self.speed = section.travel_speed * limits.speed
         self.command = Command.hold(link.position_sent)
@@ -81,7 +82,8 @@ class Mover:
         self.position: Array = first.position.copy()
         self.seen_at = first.t
         """Link time of the newest sample [s]."""
-        self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
+        own_clock = np.array([each.cadence == "cyclic" for each in self._traits])
+        self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t, own_clock)
         self.pressed: Mask = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
@@ -110,7 +112,7 @@ class Mover:
         drives = [joint.settings for joint in self.link.arm.require_link().joints]
         gains = [(getattr(each, "kp", 0.0), getattr(each, "kd", 0.0)) for each in drives]
         slowest = max(slowest_time(*each) for each in gains)
-        every = max(each.torque_cycles for each in traits_of(make_groups(self.link.arm)))
+        every = max(each.torque_cycles for each in self._traits)
         self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period, slowest, every)
 
     def cycle(self) -> Sample:
