@@ -17,7 +17,7 @@ from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import spec_of, with_effects
 from sim_gap.better_model.export import CorrectedText, joint_effects, model_files, module_text
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.model.load import SimModel
+from sim_gap.model.load import SimModel, silent
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate
@@ -57,7 +57,9 @@ class RollOuts:
                 made[body] = self._files(terms, *body)
             model, module, effects = made[body]
             torque = getattr(r, self.channel)
-            squares.append(module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share) ** 2)
+            with silent():
+                stray = module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share)
+            squares.append(stray**2)
         return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))
 
     def _files(self, terms: Sequence[Term], number: int, mount: float) -> tuple[Any, ModuleType, Any]:

@@ -1,6 +1,7 @@
 """The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -383,3 +384,15 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
         model.opt.disableflags = flags
         for loss, was in losses:
             loss[:] = was
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """MuJoCo writes no log of the simulations that break loose."""
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)

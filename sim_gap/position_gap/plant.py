@@ -4,8 +4,7 @@ Integrator, step, solver, contacts and the dynamics of actuators are the model's
 is held where it is and touches nothing. Laws that MuJoCo lacks set friction, command and applied torque at each step.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -346,18 +345,6 @@ def follow(given: Array, before: Array, most: Array) -> Array:
         left = np.abs(away) - step * (np.arange(len(command)) - np.repeat(edges[:-1], counts) + 1.0)
         out[:, j] += np.copysign(np.maximum(left, 0.0), away)
     return out
-
-
-@contextmanager
-def silent() -> Iterator[None]:
-    """MuJoCo writes no log of the simulations that break loose."""
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda text: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(None)
 
 
 def nominal_point(plant: MovedModel) -> dict[str, Array]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_gap.better_model.native_drives import hold
-from sim_gap.position_gap.plant import MovedModel, Point, silent
+from sim_gap.model.load import silent
+from sim_gap.position_gap.plant import MovedModel, Point
 from sim_gap.position_gap.windows import Windows
 
 WORLDS = 32

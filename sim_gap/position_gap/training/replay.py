@@ -11,10 +11,10 @@ from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
-from sim_gap.model.load import SimModel
+from sim_gap.model.load import SimModel, silent
 from sim_gap.position_gap.choice import without_group
 from sim_gap.position_gap.fit import Group, LoopSearch
-from sim_gap.position_gap.plant import HeldParts, held_model, silent
+from sim_gap.position_gap.plant import HeldParts, held_model
 from sim_gap.position_gap.training.export import Exported, export_beside_module
 from sim_gap.position_gap.windows import LEAST_S, WARM_S, WINDOW_S, pieces_of
 
