@@ -1,7 +1,6 @@
 """Roll-outs that break loose leave nothing between the lines of a command."""
 
 import mujoco
-import numpy as np
 from wrong_arms import THREE, Wrong, record
 
 from sim_gap.attribution.diagnose import diagnose
