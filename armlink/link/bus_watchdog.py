@@ -101,11 +101,10 @@ class BusWatch:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""
         if self._doubled or any(self._double_cycles):
             for joint, count in enumerate(self._double_cycles):
-                self._double_cycles[joint] = count + 1 if joint in self._doubled else 0
-                if (
-                    joint not in self._doubled
-                ):  # one too many, such as the answer to a request, is no debt of later ones
-                    self.readings[joint] = min(self.readings[joint], self.syncs)
+                if joint in self._doubled:
+                    self._double_cycles[joint] = count + 1
+                else:  # a reading too many, such as the answer to a request, does not count against later ones
+                    self._double_cycles[joint], self.readings[joint] = 0, min(self.readings[joint], self.syncs)
             self._doubled.clear()
         self.crowding += (self.strangers - self.crowding) / CROWDED_CYCLES
         self._crowded_cycles = self._crowded_cycles + 1 if frames > self._crowd else 0

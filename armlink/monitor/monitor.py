@@ -79,8 +79,9 @@ class Monitor(HeardArm):
     def watch(self, seconds: float) -> View:
         """Listen for `seconds`; raises BusFault if the bus fails."""
         if self._counted is None:
-            while self._loop.receive(0.0):  # what waited since the bus was opened came in another time than this
-                pass
+            end = self.clock.now() + seconds
+            while self._loop.receive(0.0) and self.clock.now() < end:
+                pass  # what waited since the bus was opened came in another time than this
         start, syncs, bits = self._counted or (self.clock.now(), self._syncs, self._loop.bits)
         sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
         sample.position = self._places.take(sample.position)

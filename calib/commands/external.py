@@ -95,6 +95,8 @@ def external(
         raise BadInput(
             f"external: {source} and {recordings[0] if recordings else picture}: give recordings or a live source"
         )
+    if not listens and (foxglove is not None or seconds):
+        raise BadInput("external: --foxglove and --seconds belong to listening, which is done without recordings")
     if listens and not (learned or baseline):
         raise BadInput(
             "external: give recordings to judge, or --picture FILE.svg for the smallest force that is felt; to listen "

@@ -93,11 +93,14 @@ class SweepScreen:
         self._progress.stop()
 
 
-def confirm(motion: str, question: str) -> list[str]:
-    """Say what will move and ask a person at the terminal; raises Declined where the answer is no.
+def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
+    """Say what will move and ask a person at the terminal, unless it was `agreed` before; raises Declined where the
+    answer is no.
 
     Without a terminal nobody is asked: the lines that say so, for the moment before it moves.
     """
+    if agreed:
+        return []
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(f"{motion}. {question}")
         return []

@@ -99,11 +99,8 @@ def sweep(
     if out is None:
         raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")
     require_vacant(out, resume)
-    unasked = (
-        []
-        if dry_run or yes
-        else confirm(f"{arm_file.name} will move through its whole range, {_load(reference_mass)}", SPACE_CLEAR)
-    )
+    motion = f"{arm_file.name} will move through its whole range, {_load(reference_mass)}"
+    unasked = confirm(motion, SPACE_CLEAR, dry_run or yes)
     load = reference_mass if dry_run else 0.0
 
     def going_on() -> str:

@@ -50,7 +50,7 @@ def verify(
     if report is not None:
         require_extra("--report", "reports")
     arm_file = with_tool(load_arm(arm), tool)
-    unasked = [] if yes else confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR)
+    unasked = confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR, yes)
     with (
         early_end(arm_file, command_line("verify", arm, bus=bus, tool=tool, store=store)) as work,
         open_arm(arm_file, bus) as link,

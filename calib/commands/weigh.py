@@ -40,11 +40,8 @@ def weigh(
 
     arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
     gravity, calibration = records.required(GravityRecord, arm_file), records.required(CalibrationRecord, arm_file)
-    unasked = (
-        []
-        if yes
-        else confirm(f"{arm_file.name} will drive to {poses} poses all over its range, with its load", SPACE_CLEAR)
-    )
+    motion = f"{arm_file.name} will drive to {poses} poses all over its range, with its load"
+    unasked = confirm(motion, SPACE_CLEAR, yes)
     with (
         early_end(arm_file, command_line("weigh", arm, bus=bus, store=store)) as work,
         open_arm(arm_file, bus) as link,

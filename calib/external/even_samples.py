@@ -18,6 +18,12 @@ SHORTEST = 1.0
 """Of a part [s] that counts."""
 
 
+def averaged_samples(t: Array, rate: float) -> int:
+    """How many samples at times (K,) [s] go into a value at `rate` [Hz]: all of its period, to the 2 % that clocks are
+    apart."""
+    return max(1, int(1.02 / (rate * float(np.median(np.diff(t))))))
+
+
 def rate_of(recordings: Sequence[Recording]) -> float:
     """The rate at which all of them are sampled [Hz], a multiple of the rows' rate. Raises BadInput if too slow."""
     slowest = min(1.0 / float(np.median(np.diff(each.t))) for each in recordings)
@@ -54,8 +60,7 @@ def even_samples(
 
 def _resampled(even: Array, t: Array, values: Array, rate: float) -> Array:
     """Means over a period where the recording is faster, else straight lines between its rows."""
-    period = float(np.median(np.diff(t)))
-    count = int(1.0 / rate / period)
+    count = averaged_samples(t, rate)
     if count >= 2:
         kernel = np.ones(count) / count
         pad = np.pad(values, ((count // 2, count - 1 - count // 2), (0, 0)), mode="edge")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.external.even_samples import LONGEST_GAP
+from calib.external.even_samples import LONGEST_GAP, averaged_samples
 from calib.external.learned import Learned
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactDetector, ContactEvent
@@ -106,7 +106,7 @@ class LiveExternal:
         if not self._averaged:
             if len(rows) < MEASURED_SAMPLES:
                 return rows[:0]
-            self._averaged = max(1, int(1.02 * period / float(np.median(np.diff(rows[:, 0])))))
+            self._averaged = averaged_samples(rows[:, 0], self.learned.listener.rate)
         if len(rows) <= self._averaged:
             return rows[:0]
         means = rows

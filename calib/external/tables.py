@@ -69,9 +69,8 @@ def event_text(event: dict[str, Any]) -> str:
 
 def wrench_of(told: Wrench) -> dict[str, list[float]]:
     """Force [N] and moment [N·m] of one row with their standard deviations, NaN along axes that joints do not show."""
-    std = np.where(told.determined[0], np.sqrt(np.diagonal(told.covariance[0])), np.nan)
-    parts = (("force", slice(3)), ("moment", slice(3, 6)))
-    return {f"{name}{end}": x[part].tolist() for name, part in parts for end, x in (("", told.value[0]), ("_std", std))}
+    value, std = told.value[0].tolist(), told.std[0].tolist()
+    return {"force": value[:3], "force_std": std[:3], "moment": value[3:], "moment_std": std[3:]}
 
 
 def columns_of(heard: Heard) -> dict[str, Array]:
@@ -79,13 +78,11 @@ def columns_of(heard: Heard) -> dict[str, Array]:
     columns = {"t": heard.t}
     for prefix, values in (("tau_ext", heard.judged.external), ("tau_ext_std", heard.judged.std)):
         columns |= {f"{prefix}_{j + 1}": values[:, j] for j in range(values.shape[1])}
-    told = heard.wrench
-    std = np.sqrt(np.diagonal(told.covariance, axis1=1, axis2=2))
+    told, std = heard.wrench, heard.wrench.std
     for k, axis in enumerate(AXES):
         columns |= {
-            f"force_{axis}": told.value[:, k], f"force_{axis}_std": np.where(told.determined[:, k], std[:, k], np.nan),
-            f"moment_{axis}": told.value[:, 3 + k],
-            f"moment_{axis}_std": np.where(told.determined[:, 3 + k], std[:, 3 + k], np.nan),
+            f"force_{axis}": told.value[:, k], f"force_{axis}_std": std[:, k],
+            f"moment_{axis}": told.value[:, 3 + k], f"moment_{axis}_std": std[:, 3 + k],
             f"point_force_{axis}": told.force[:, k], f"point_force_{axis}_std": told.force_std[:, k],
         }  # fmt: skip
     return columns
@@ -131,14 +128,11 @@ def _save_observations(path: Path, judged: Sequence[tuple[str, Array, Sequence[H
         episode = label.rpartition("#")[2]
         episodes.append(np.full(len(t), int(episode) if "#" in label and episode.isdigit() else number))
         times.append(t)
-        std = [np.sqrt(np.diagonal(each.wrench.covariance, axis1=1, axis2=2)) for each in heard]
         rows = {
             "external_torque": [each.judged.external for each in heard],
             "external_torque_std": [each.judged.std for each in heard],
             "external_wrench": [each.wrench.value for each in heard],
-            "external_wrench_std": [
-                np.where(each.wrench.determined, x, np.nan) for each, x in zip(heard, std, strict=True)
-            ],
+            "external_wrench_std": [each.wrench.std for each in heard],
         }
         known = np.concatenate([each.t for each in heard])
         newest = np.searchsorted(known, t + 1e-6, side="right") - 1

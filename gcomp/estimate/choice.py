@@ -35,8 +35,6 @@ class Effect(Generic[Name]):
     name: Name
     parameters: tuple[int, ...]
     needs: tuple[Name, ...] = ()
-    least: float = 0.0
-    """Fall of the cost that it has to bring, if that is more than the price."""
     price: float | None = None
     """Price, if it is not that of all its parameters: some may show nothing, and a rare effect costs more."""
     excludes: frozenset[Name] = frozenset()
@@ -322,7 +320,7 @@ def evidence(terms: LinearTerms, less: Iterable[int], more: Iterable[int]) -> He
 
 
 def price_of(effect: Effect[Name]) -> float:
-    return max(PRICE * len(effect.parameters), effect.least) if effect.price is None else effect.price
+    return PRICE * len(effect.parameters) if effect.price is None else effect.price
 
 
 def choose(

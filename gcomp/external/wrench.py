@@ -30,6 +30,11 @@ class Wrench:
     force_std: Array
     """(S, 3) [N]."""
 
+    @property
+    def std(self) -> Array:
+        """Standard deviations of `value` (S, 6); NaN as there."""
+        return np.where(self.determined, np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), np.nan)
+
 
 def wrench(motion: RigidMotion, link: int, point: Array, external: Array, std: Array, precision: Array) -> Wrench:
     """At a point of a link's bar frame, from external torques (S, n), their standard deviations and the inverse of

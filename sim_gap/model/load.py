@@ -391,8 +391,9 @@ def silent() -> Iterator[None]:
     """MuJoCo writes no log of the simulations that break loose."""
     import mujoco
 
+    before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: None)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(None)
+        mujoco.set_mju_user_warning(before)

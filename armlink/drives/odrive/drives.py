@@ -352,14 +352,17 @@ def _checked(value: float) -> float:
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     """By the heartbeats heard; another device hardly sends nothing but CANSimple on its identifiers."""
-    known, beats, others = sum(AxisError), dict[int, list[bool]](), set[int]()
+    known, messages, beats, others = sum(AxisError), set(map(int, Message)), dict[int, list[bool]](), set[int]()
     for can_id, data in bus.heard:
-        if can_id <= 0x7FF and can_id & 0x1F not in {*map(int, Message)}:
-            others.add(can_id >> 5)
-        elif can_id <= 0x7FF and can_id & 0x1F == Message.HEARTBEAT:
+        node, message = can_id >> 5, can_id & 0x1F
+        if can_id > 0x7FF:
+            continue
+        if message not in messages:
+            others.add(node)
+        if message == Message.HEARTBEAT:
             beat = frames.heartbeat(data)
             real = beat is not None and not beat.error & ~known and beat.state <= max(AxisState) and beat.done <= 1
-            beats.setdefault(can_id >> 5, []).append(real)
+            beats.setdefault(node, []).append(real)
     return [
         FoundDrive("odrive", node, f"node {node}", {"node": node}, note="gear assumed 1: torques are the motor's")
         if node < 0x3F

@@ -132,18 +132,17 @@ def new(
         suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
         raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
     out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
-    if is_arm_file:
-        load_arm(bundled or model)
-    elif not model.is_file():  # before anything is asked
+    found = bundled or model
+    have_ids = is_arm_file and drives_have_ids(load_arm(found))
+    if not found.is_file():  # before anything is asked
         raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
     if is_xacro:
         model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
-        found, is_bundled = bundled or model, bundled is not None
-        by_ids = not by_hand and drives_have_ids(load_arm(found))
+        by_ids = have_ids and not by_hand
         ask = None if by_ids else _hand(str(bus), by_hand, interactive)
-        return rewire(found, out, str(bus), ask, by_ids=by_ids, bundled=is_bundled, json=json_file)
+        return rewire(found, out, str(bus), ask, by_ids=by_ids, bundled=bundled is not None, json=json_file)
     if bus is not None:
         open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
     with console.status(f"reading {model} and looking for collisions"):

@@ -14,6 +14,7 @@ from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
+from calib.external.even_samples import averaged_samples
 from calib.records.records import GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.load import inertial_torque, load_model, place_chain
@@ -208,3 +209,9 @@ def test_bad_input_is_one_line(workplace, monkeypatch, capsys, words, said):
     monkeypatch.chdir(workplace)
     assert run(["external", *words.split()]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("step", [0.00395, 0.004, 0.00405])
+def test_as_many_samples_are_averaged_by_clocks_that_are_a_little_apart(step):
+    """Live rows and recordings of one arm have the same noise."""
+    assert averaged_samples(step * np.arange(50.0), 125.0) == 2

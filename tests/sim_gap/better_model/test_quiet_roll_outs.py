@@ -4,6 +4,7 @@ import mujoco
 from wrong_arms import THREE, Wrong, record
 
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.model.load import silent
 
 LIGHT = 'pos="0 0 0" mass="0.001" diaginertia="1e-12 1e-12 1e-12"'
 
@@ -19,3 +20,14 @@ def test_a_link_with_next_to_no_inertia_writes_no_warnings_of_the_simulator(tmp_
     assert diagnose(model, [recording]).rollout is not None
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_who_takes_the_warnings_does_so_again_afterwards():
+    took, before = [], mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(took.append)
+    try:
+        with silent():
+            pass
+        assert mujoco.get_mju_user_warning() == took.append
+    finally:
+        mujoco.set_mju_user_warning(before)
