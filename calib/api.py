@@ -113,7 +113,14 @@ def sweep(
     refuse_impossible_sweep(arm_file, reference_mass)
     with _enabled(arm, bus, simulated, reference_mass if simulated else 0.0) as link:
         return run_sweep(
-            link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
+            link,
+            arm_file,
+            Path(out),
+            reference_mass=reference_mass,
+            resume=resume,
+            seed=seed,
+            progress=progress,
+            bus=bus,
         )
 
 

@@ -55,6 +55,8 @@ class Manifest(_Model):
     """[N·m]"""
     drives: Annotated[tuple[str, ...], Field(exclude_if=lambda value: not value)] = ()
     """Serial numbers of the drives, joint by joint, empty for one that tells none; () if none does."""
+    bus: Annotated[str, Field(exclude_if=lambda value: not value)] = ""
+    """The bus that was given, instead of the arm file's; empty if none was."""
     created: AwareDatetime
     software: str
 
@@ -65,6 +67,7 @@ class Manifest(_Model):
         reference_mass: float,
         installed: Sequence[TorqueCalibration[float]] | None = None,
         drives: Sequence[str] = (),
+        bus: str | None = None,
     ) -> Self:
         """The manifest of a new data set of this arm; `installed` is what the controllers hold, by default nothing."""
         pairs = installed or [UNCALIBRATED] * len(arm_file.joint_names)
@@ -79,6 +82,7 @@ class Manifest(_Model):
             installed_gain=tuple(each.gain for each in pairs),
             installed_offset=tuple(each.offset for each in pairs),
             drives=tuple(drives) if any(drives) else (),
+            bus=bus or "",
             created=datetime.now(UTC).replace(microsecond=0),
             software=f"armlink {version('armlink')}",
         )

@@ -110,7 +110,7 @@ def identify(
     out = results(json_file)
     _show(fit, out)
     out.print(f"record {record.id} is current: {fit.identifiable.sum()} of {len(fit.beta)} mass moments are determined")
-    suggest(command_line("verify", arm_file.argument, store=store))
+    suggest(command_line("verify", arm_file.argument, bus=sweeps[-1].manifest.bus or None, store=store))
     write_json(json_file, _answer(fit, record.id))
     return 0
 

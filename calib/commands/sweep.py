@@ -107,7 +107,8 @@ def sweep(
         words = [arm, *["--resume"] * (out / MANIFEST).exists(), *["--dry-run"] * dry_run]
         return command_line("sweep", *words, out=out, reference_mass=reference_mass or None, bus=bus, hold=hold)
 
-    opened = open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load)
+    of_link = None if dry_run else bus
+    opened = open_link(arm_file, of_link, simulated=dry_run, load=load)
     with early_end(arm_file, going_on) as work, opened as link:
         link.start()
         print_lines(unasked)
@@ -123,6 +124,7 @@ def sweep(
                 resume,
                 seed,
                 check_stops and not resume and not reference_mass,
+                of_link,
             )
         lateness = link.stats.lateness
     _show(arm_file, found, data, results(json_file), _again(arm, bus, hold, dry_run))
@@ -181,6 +183,7 @@ def _run(
     resume: bool,
     seed: int,
     check_stops: bool,
+    bus: str | None,
 ) -> "tuple[Preflight, SweepData]":
     from calib.arm.sweep_section import sweep_motion
     from calib.sweep.preflight import find_stops, listen
@@ -205,6 +208,7 @@ def _run(
         progress=screen.update,
         seed=seed,
         on_stall=on_stall,
+        bus=bus,
     )
     return found, data
 

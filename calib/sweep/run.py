@@ -25,18 +25,20 @@ def run_sweep(
     seed: int = 0,
     on_stall: OnStall = give_up,
     plan: SweepPlan | None = None,
+    bus: str | None = None,
 ) -> SweepData:
     """One pass over all joints with `reference_mass` [kg] attached (0 for none), into the directory `out`.
 
     The link must have been enabled; the joints hold at the end. Steps begin with the scout, which finds the bias
     torques; creeps follow `plan` where one is given. With `resume` it goes on after the last reading on disk. After a
     Stall that `on_stall` accepts the joints are enabled again and the interrupted reading is repeated; a creeping joint
-    that meets something is led back, and its sweep is noted with the reason and has no readings. Raises BadInput,
-    Refused if the arm cannot be swept or too many creeps meet something, BusFault; every reading made is on disk.
+    that meets something is led back, and its sweep is noted with the reason and has no readings. `bus` is what was
+    given instead of the arm file's. Raises BadInput, Refused if the arm cannot be swept or too many creeps meet
+    something, BusFault; every reading made is on disk.
     """
     installed = repeat_work(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
     drives = repeat_work(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
-    with DataWriter(out, Manifest.of(arm, reference_mass, installed, drives), resume) as writer:
+    with DataWriter(out, Manifest.of(arm, reference_mass, installed, drives, bus), resume) as writer:
         mover = repeat_work(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
         kind = CreepPass if sweep_motion(arm) == "creep" else StepPass
         run = kind(arm, mover, writer, load_data(out), progress, on_stall)

@@ -78,7 +78,9 @@ def test_from_sweeps_to_a_verified_model(
         assert gain == pytest.approx(1.0, abs=0.01)
         assert low < gain < high
     assert run(["identify", *passes, *store, "--json", "-"]) == 0
-    gravity = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    gravity, where = json.loads(said.out), f"--bus armlink_sim:{arm_path.parent / 'heavier.yaml'}"
+    assert said.err.splitlines()[-1].startswith(f"next: armlink verify {arm_path} {where}"), "where it was swept last"
     assert all(gravity["identifiable"])
     assert gravity["recursive"] == pytest.approx(gravity["beta"], abs=0.02)
     assert run(["verify", str(arm_path), *bus, *store, "--poses", "4", "--json", "-"]) == 0
