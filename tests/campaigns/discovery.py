@@ -16,12 +16,14 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +111,8 @@ def turned_by_hand(folder: Path, control: Path, *words: str) -> tuple[int, str]:
             os.write(terminal, b"\n")
         elif plain.endswith(("[y/n]:", "[Y/n]:", "[y/N]:")):
             os.write(terminal, b"y\n")
+    else:
+        os.kill(process, signal.SIGKILL)
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), shown
 
 
@@ -121,7 +125,7 @@ def tried(arm: str, bus: str, seed: int) -> list[str]:
         folder = Path(scratch)
         bundled = folder / "arm.yaml"
         bundled.write_text(yaml.safe_dump(yaml.safe_load(bundled_arms()[arm].read_text()) | {"sweep": SHORT}))
-        first = json.loads(json.dumps(content))
+        first = deepcopy(content)
         delivered = first["link"]["joints"][AS_DELIVERED]["drive"]
         if "reply" in delivered:
             delivered["reply"] = 0
