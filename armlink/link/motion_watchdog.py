@@ -155,9 +155,9 @@ class MotionWatch:
             if interval > 0.0 and interval_before > 0.0:
                 mean = (here - there) / interval
                 mean_before = (there - before) / interval_before
-                reach = interval / 2 + lead
-                speed = abs(mean + (mean - mean_before) / ((interval + interval_before) / 2) * reach)
-                least = speed - exact * (2 / interval + 4 * reach / interval**2)
+                reach = (interval / 2 + lead) / ((interval + interval_before) / 2)
+                speed = abs(mean + (mean - mean_before) * reach)
+                least = speed - 2 * exact * ((1 + reach) / interval + reach / interval_before)
                 if least > found:  # not NaN
                     found = least
             there, then = before, earlier

@@ -55,6 +55,21 @@ def test_a_sound_joint_is_neither_contradicted_nor_proven_fast(motion):
         now = max(answered, asked + PERIOD)
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.5))
+def test_no_joint_is_ahead_of_its_own_acceleration_however_unevenly_its_readings_come(seed, late):
+    random = np.random.default_rng(seed)
+    made, now, lead = watch(2 * np.pi / 2**16), 0.0, 3 * PERIOD
+    speed, acceleration = random.uniform(-1.0, 1.0), random.uniform(-5.0, 5.0)
+    step, turned = 2 * np.pi / 2**16, []
+    for _ in range(100):
+        turned.append(abs(speed + acceleration * now))
+        reading = step * np.rint((speed * now + acceleration * now**2 / 2) / step)
+        made.update([reading], [now], [now], [turned[-1]], [now])
+        assert made.ahead[0] <= max(*turned[-9:], abs(speed + acceleration * (now + lead))) + 1e-6
+        now += random.uniform(0.0, 0.1) * PERIOD if random.random() < late else random.uniform(0.5, 3.0) * PERIOD
+
+
 def test_a_steady_speed_is_proven_by_positions_alone():
     made = watch(2 * np.pi / 2**17)
     for cycle in range(40):
