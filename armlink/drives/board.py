@@ -43,8 +43,10 @@ class Board:
         """1 for a joint whose readings are replies to the cycle, 0 for one that sends by its own clock."""
         self.came = [0] * n
         """Readings of each joint that came, in their cycle or late."""
-        self.owed = [0] * n
-        """Replies of each joint to earlier cycles that are still to come, or lost."""
+        self.unanswered = [0] * n
+        """Commands of each joint whose replies are still to come, or lost; replies come in the order of commands."""
+        self.answered = [0] * n
+        """To which command the newest reading of each joint is the reply: 1 for the newest, 2 for the one before."""
         self.slow_came = False
         """Whether motor torque or velocity of some joint came."""
         self.errors = 0
@@ -54,7 +56,7 @@ class Board:
         self.readings = [0] * n
         """Readings of each joint; the watch of the bus takes stock of them."""
         self.on_again: Callable[[int], None] = lambda joint: None
-        """Called where a second reading of a joint comes in a cycle."""
+        """Called where a reading of a joint comes for which there is no command."""
         self.on_slow: Callable[[int], None] = lambda joint: None
         """Called where motor torque and velocity of a joint come apart from its position."""
 
@@ -63,10 +65,12 @@ class Board:
         self.came[joint] += 1
         self.readings[joint] += 1
         if self.asked[joint]:
-            if self.position[joint] != self.position[joint]:  # NaN: the first in this cycle
+            if self.position[joint] != self.position[joint]:  # NaN: the first since the last sample
                 self.awaited -= 1
+            left = self.answered[joint] = self.unanswered[joint]
+            if left:
+                self.unanswered[joint] = left - 1
             else:
-                self.owed[joint] = max(self.owed[joint] - 1, 0)
                 self.on_again(joint)
         self.position[joint], self.sensor[joint] = position, sensor
 
@@ -75,13 +79,10 @@ class Board:
         self.slow_came = True
         self.on_slow(joint)
 
-    def drop(self, asked: int = 1) -> None:
-        """Forget positions and sensor torques that were replies (1), since what comes from now on belongs to the next
-        sample; or those of drives that send by their own clock (0), since they are in a sample now."""
-        count = self.asked.count(asked)
-        if count == self.n:
-            self.position, self.sensor = [math.nan] * self.n, [math.nan] * self.n
-        elif count:
-            for joint, each in enumerate(self.asked):
-                if each == asked:
-                    self.position[joint] = self.sensor[joint] = math.nan
+    def ask(self) -> None:
+        """A command to each joint leaves."""
+        self.unanswered = [left + asked for left, asked in zip(self.unanswered, self.asked, strict=True)]
+
+    def drop(self) -> None:
+        """Forget positions and sensor torques: what comes from now on belongs to the next sample."""
+        self.position, self.sensor = [math.nan] * self.n, [math.nan] * self.n

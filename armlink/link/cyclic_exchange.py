@@ -32,8 +32,10 @@ LEAST_REST = 1e-4
 """Shorter rests are not worth their system call [s]."""
 RECEPTION_TRIES = 16
 """A frame is asked for so often of a port that reports faults; a batch that tells of one may hold frames too."""
-OWED_CYCLES = 25
-"""A reply that has been owed for this many cycles is lost."""
+LATE_CYCLES = 3
+"""A joint that has answered in so many cycles, and never caught up, is not late: a reply was lost."""
+ASKS_KEPT = 27
+"""Replies are attributed to so many commands back: a joint that is silent for longer has the link stopped."""
 _UNTAGGED = (1 << BUS_SHIFT) - 1
 
 
@@ -107,11 +109,11 @@ class Loop:
         """When the velocity of each joint last came, by the clock [s]."""
         self.synced = -math.inf
         """When the last commands left, by the clock [s]."""
-        self._owed_for = 0
-        """Cycles for which some reply has been owed."""
+        self._behind = [0] * self.n
+        """Cycles in which each joint has answered since it last caught up with its commands."""
         self.earliest, self.latest = [-math.inf] * self.n, [-math.inf] * self.n
         """Bounds of the time at which the newest position of each joint was taken, by the clock [s]."""
-        self._asked_at: deque[float] = deque(maxlen=OWED_CYCLES + 2)
+        self._asked_at: deque[float] = deque(maxlen=ASKS_KEPT)
         """When the newest commands left, by the clock [s]."""
         self._collected = self._heard_until = -math.inf
         """When the replies of this cycle and of the one before were in, by the clock [s]."""
@@ -164,13 +166,13 @@ class Loop:
         """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
         board = self.board
         complete, board.awaited = self.just_woke and board.awaited <= 0, 0
-        if (not complete and self._take_what_is_there()) or self._owed_for:
-            self._keep_late()
+        if not complete:
+            self._take_what_is_there()
+        self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
         if board.slow_came:
             self._keep_slow(self._clock.now())
-        board.drop()
 
     def _take_what_is_there(self) -> int:
         """Take in the frames that are there, counted all at once; how many they were."""
@@ -192,22 +194,22 @@ class Loop:
         return came
 
     def _keep_late(self) -> None:
-        """Replies that came after their cycle: as old as the last commands at least."""
+        """Replies that came after their cycle: as old as the last commands at least, and of no sample."""
         board, values = self.board, self.values
         now = self._clock.now()
         for joint, raw in enumerate(board.position):
             if raw == raw and board.asked[joint]:  # not NaN
                 self.latest_position[joint] = values.position_of(joint, raw)
-                self._note_time(joint, max(board.owed[joint], 1), now)
+                self._note_time(joint, now)
                 self.seen[joint] = max(self.seen[joint], self.synced)
-                board.owed[joint] = max(board.owed[joint] - 1, 0)
+                board.position[joint] = board.sensor[joint] = math.nan
 
     def settle(self) -> None:
-        """After an interruption: nothing is owed, nothing was lost, no node is crowding the bus."""
+        """After an interruption: nothing is to come, nothing was lost, no node is crowding the bus."""
         self.just_woke = False
         self.drain()
         self.synced = -math.inf
-        self.board.owed, self._owed_for = [0] * self.n, 0
+        self.board.unanswered, self._behind = [0] * self.n, [0] * self.n
         self._dropped = self._port.dropped
         self.watch.settle()
 
@@ -235,6 +237,7 @@ class Loop:
         if self.keeper is not None:
             self.keeper.renew(self._safe_frames())
         board.awaited = self._expected
+        board.ask()
         self.watch.syncs += 1
         self.stats.asked += 1
         self._port.send_all(frames)
@@ -246,7 +249,7 @@ class Loop:
         delay = self._collect(now, until)
         self._heard_until, self._collected = self._collected, now if self._lock_step else now + delay
         self.stats.missed += board.awaited
-        timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
+        timely = self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
         self.on_cycle()
@@ -320,16 +323,20 @@ class Loop:
                     found.append((can_id | group.tag, data))
         return found
 
-    def _timely(self) -> NDArray[np.bool_]:
-        """Which readings are replies to this cycle's commands; replies that are owed for long are lost."""
+    def _timely(self) -> NDArray[np.bool_] | None:
+        """Which readings are replies to this cycle's commands; None: all. Of a joint that does not catch up for long, a
+        reply was lost."""
         board = self.board
+        unanswered, behind = board.unanswered, self._behind
+        if not any(unanswered):
+            self._behind = [0] * self.n
+            return None
         came = [raw == raw for raw in board.position]
-        timely = np.array([here and not owed for here, owed in zip(came, board.owed, strict=True)])
-        pairs = zip(came, board.owed, board.asked, strict=True)
-        board.owed = [owed + (asked and not here) for here, owed, asked in pairs]
-        self._owed_for = self._owed_for + 1 if any(board.owed) else 0
-        if self._owed_for > OWED_CYCLES:
-            board.owed, self._owed_for = [0] * self.n, 0
+        timely = np.array([here and not left for here, left in zip(came, unanswered, strict=True)])
+        for joint, here in enumerate(came):
+            behind[joint] = behind[joint] + here if unanswered[joint] else 0
+            if behind[joint] >= LATE_CYCLES:
+                unanswered[joint] = behind[joint] = 0
         return timely
 
     def listen(self, seconds: float) -> Sample:
@@ -416,27 +423,23 @@ class Loop:
         else:
             motor, velocity = self._nothing.copy(), self._nothing.copy()
         torque = values.torque(np.array(board.sensor), motor)
-        board.drop(asked=0)
+        board.drop()
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
-            self._note_time(joint, board.owed[joint] + 1, self._collected)
+            self._note_time(joint, self._collected)
         self.stats.cycles += 1
         self.stats.errors = board.errors
         status: NDArray[np.int64] = np.array(board.status, np.int64)
         age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
 
-    def _note_time(self, joint: int, back: int, latest: float) -> None:
-        """When the newest position of a joint was taken: before `latest` [s], and no earlier than it was asked for,
-        `back` commands ago; of a drive that sends by its own clock, than the readings before had been taken in."""
-        asked = self._asked_at
-        earliest = asked[-min(back, len(asked))] if asked else -math.inf
+    def _note_time(self, joint: int, latest: float) -> None:
+        """When the newest position of a joint was taken: before `latest` [s], and no earlier than the command left to
+        which it is the reply; of a drive that sends by its own clock, than the readings before had been taken in."""
+        asked, back = self._asked_at, self.board.answered[joint]
+        earliest = asked[-min(max(back, 1), len(asked))] if asked else -math.inf
         self.earliest[joint] = earliest if self.board.asked[joint] or self._lock_step else self._heard_until
         self.latest[joint] = latest
-
-    def drop_readings(self) -> None:
-        """Forget what came: what comes from now on belongs to the next sample."""
-        self.board.position, self.board.sensor = [math.nan] * self.n, [math.nan] * self.n
 
     def _keep_slow(self, now: float) -> tuple[Array, Array]:
         """Motor torque and velocity that came, also kept as the newest known."""

@@ -195,14 +195,14 @@ class Listener(HeardArm, Calibrations):
         """A cycle begins: what came since the one before is its sample."""
         if self._sync is None or self._since is None:
             self._loop.reset_counters()
-            self._loop.drop_readings()
+            self._loop.board.drop()
             self._since = now
         else:
             sample = self._loop.sample(self._sync)
             sample.position = self._places.take(sample.position)
             sample.t = self._sync
             self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
-            self._loop.drop_readings()
+            self._loop.board.drop()
             self._ready.append((sample, self._host.ended))
         self._sync = now
 

@@ -122,7 +122,7 @@ class MotionWatch:
         age = speed = 0.0
         if told == told:  # not NaN
             age, speed = FILTER_TIME + until - came, abs(told)
-        if until > own.newest:
+        if until > own.newest and since > -math.inf:  # a reading that nobody asked for may be of any time
             own.newest = until
         else:
             here = math.nan

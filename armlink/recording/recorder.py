@@ -43,7 +43,7 @@ class Recorder(HeardArm):
         """A cycle that begins completes the row of the previous one."""
         sample = self._loop.sample(now)
         sample.position = self.places.take(sample.position)
-        self._loop.drop_readings()
+        self._loop.board.drop()
         if self._sync is not None and self._start is not None:
             torque, position = self._host.decode(self._host.ended, sample)
             channels = {

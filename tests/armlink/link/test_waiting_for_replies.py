@@ -1,16 +1,22 @@
 """The loop sleeps until the replies should be there, instead of waking for each, and takes those that come later."""
 
+import struct
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from armlink.arm_file import load_arm
 from armlink.bus.port import Frame
-from armlink.drives.orders import Power
+from armlink.drives.orders import Order, Power
+from armlink.link.cyclic_exchange import LATE_CYCLES
 from armlink.link.types import Command
 from armlink.selftest.host import EchoPort, echo_commander
 
 N = 7
+STEP = 1e-3
+"""From the position of one reply to that of the next [rad]."""
+STILL = [Order(Power.OFF, False, 0, 0.0, 0.0, 0.0, 0.0, 0.0)] * N
 BETWEEN = 1.3e-4
 """Time of one reply on the wire [s]."""
 
@@ -175,3 +181,69 @@ def test_replies_that_come_after_every_cycle_are_no_silence() -> None:
     ages = np.array([commander.command(hold).age for _ in range(100)])[10:]
     assert (ages > 0.99 * period).all()
     assert (ages < 2.5 * period).all()
+
+
+class Behind(EchoPort):
+    """Joints that answer every command in turn, now and then late all together, with frames of others between.
+
+    A joint's position tells to which command it is the reply.
+    """
+
+    def __init__(self, clock: WaitedFor, seed: int, stalls: float) -> None:
+        super().__init__(load_arm("sarcos"))
+        self.clock, self.random, self.stalls = clock, np.random.default_rng(seed), stalls
+        self.commands, self.free = 0, 0.0
+        self.taken: list[float] = []
+        """When the reply to each command was made, by the number of the command."""
+        self.lost: set[int] = set()
+        self.coming: list[tuple[float, Frame]] = []
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        number, now = self.commands, self.clock.time
+        self.commands += 1
+        stalls = self.random.random() < self.stalls
+        self.free = max(self.free, now + self.random.uniform(1e-4, 0.02 if stalls else 1e-3))
+        self.taken.append(self.free)
+        if number in self.lost:
+            return
+        for can_id, _ in frames:
+            self.free += 2e-5
+            reply = struct.pack("<ff", number * STEP, 0.0)
+            self.coming.append((self.free, (can_id - 1 + 0x100, reply)))
+        self.coming.append((self.free + self.random.uniform(0.0, 3e-3), (0x7F0, b"")))
+        self.coming.sort(key=lambda each: each[0])
+
+    def receive(self, timeout: float) -> Frame | None:
+        if not self.coming or self.coming[0][0] > self.clock.time + timeout:
+            self.clock.time += timeout
+            return None
+        comes, frame = self.coming.pop(0)
+        self.clock.time = max(self.clock.time, comes)
+        return frame
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_reading_was_taken_between_its_own_command_and_its_coming_however_late_it_is(seed: int) -> None:
+    clock = WaitedFor(1e-5)
+    port = Behind(clock, seed, stalls=0.1)
+    loop = echo_commander(load_arm("sarcos"), port, clock).loop
+    for _ in range(400):
+        clock.time += port.random.uniform(0.0, 4e-3)
+        loop.drain()
+        loop.exchange(STILL, clock.time)
+        for joint in range(N):
+            if loop.seen[joint] > 0.0:
+                number = round(loop.latest_position[joint] / STEP)
+                assert loop.earliest[joint] <= port.taken[number] <= loop.latest[joint]
+
+
+def test_a_lost_reply_is_waited_for_only_a_few_cycles() -> None:
+    clock = WaitedFor(1e-5)
+    port = Behind(clock, 0, stalls=0.0)
+    port.lost = {50}
+    loop, untimely = echo_commander(load_arm("sarcos"), port, clock).loop, 0
+    for _ in range(100):
+        clock.time += 3e-3
+        loop.drain()
+        untimely += not loop.exchange(STILL, clock.time).all_timely
+    assert untimely == 1 + LATE_CYCLES
