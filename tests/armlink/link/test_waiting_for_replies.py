@@ -225,7 +225,7 @@ class Behind(EchoPort):
 @pytest.mark.parametrize("seed", range(20))
 def test_a_reading_was_taken_between_its_own_command_and_its_coming_however_late_it_is(seed: int) -> None:
     clock = WaitedFor(1e-5)
-    port = Behind(clock, seed, stalls=0.1)
+    port = Behind(clock, seed, stalls=0.03)
     loop = echo_commander(load_arm("sarcos"), port, clock).loop
     for _ in range(400):
         clock.time += port.random.uniform(0.0, 4e-3)
