@@ -1,5 +1,7 @@
 """The global fit: exact Jacobian, exact without noise, robust start, honest intervals, outliers."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from gravity_rig import DOWN, SARCOS_BETA, make_random_arm, make_readings, make_sarcos, sweep_rows
@@ -266,3 +268,13 @@ def test_columns_that_are_zero_but_for_rounding_do_not_run_away() -> None:
     found = identify_global(arm, rows, unknown=FAMILIES, priors=prior)
     assert found.values.gain[1:] == pytest.approx([0.87, 1.04], abs=1e-6)
     assert abs(found.complete.rho[2]) < 1
+
+
+def test_ten_thousand_samples_are_fitted_in_bounded_memory(sarcos, rng) -> None:
+    q = rng.uniform(sarcos.lower, sarcos.upper, (10_000, 7))
+    true = Parameters.nominal(7, beta=SARCOS_BETA, offset=np.linspace(-1, 1, 7))
+    rows = make_readings(sarcos, true, q, np.zeros_like(q), sigma=0.05)
+    tracemalloc.start()
+    identify_global(sarcos, rows, unknown=("offset", "beta"))
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
