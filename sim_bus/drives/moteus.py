@@ -131,12 +131,12 @@ class MoteusDrive(SimulatedDrive):
 
     def _shown_in_cycles(self) -> dict[int, float]:
         """Registers of the reply to a host's usual frame."""
-        position, velocity, torque = self.told()
+        position, velocity, torque = self.coded()
         return {
             MoteusRegister.MODE: self.mode,
-            MoteusRegister.POSITION: position / TURN * self._shown("position"),
-            MoteusRegister.VELOCITY: velocity / TURN * self._shown("velocity"),
-            MoteusRegister.TORQUE: torque * self._shown("torque"),
+            MoteusRegister.POSITION: position / TURN,
+            MoteusRegister.VELOCITY: velocity / TURN,
+            MoteusRegister.TORQUE: torque,
             MoteusRegister.TEMPERATURE: STAGE_TEMPERATURE,
             MoteusRegister.FAULT: self.fault_code,
         }
@@ -163,9 +163,6 @@ class MoteusDrive(SimulatedDrive):
             }
         )
 
-    def _shown(self, quantity: str) -> float:
-        return 1.0 / self.scale(quantity)
-
     # ---- modes
 
     def _enter(self, mode: int) -> None:
@@ -179,7 +176,7 @@ class MoteusDrive(SimulatedDrive):
             self.heard = self.now
             if self.mode is not MoteusMode.POSITION:
                 self._target, self._integral = self.motor.position, 0.0
-            position = self.command[MoteusRegister.COMMAND_POSITION] * TURN / self._shown("position")
+            position = self.command[MoteusRegister.COMMAND_POSITION] * TURN * self.scale("position")
             if math.isfinite(position):
                 self._target = position
             self.mode = MoteusMode.POSITION

@@ -41,16 +41,12 @@ class ODriveAxis(SimulatedDrive):
         """Position [rad], velocity [rad/s], torque [N·m]."""
         self._watchdog = link.deadline
         period = max(int(1000 / link.rate + 1e-9), 1) / 1000
-        self._periods = {**RATES, Message.ESTIMATES: period, Message.TORQUES: period}
-        self._next = dict.fromkeys(self._periods, 0.0)
+        for message, each in {**RATES, Message.ESTIMATES: period, Message.TORQUES: period}.items():
+            self.send_every(each, message)
 
     @property
     def patience(self) -> float:
         return self._watchdog
-
-    @property
-    def due(self) -> float:
-        return min(super().due, *self._next.values())
 
     def takes(self, can_id: int) -> bool:
         return (can_id & ~REMOTE) >> 5 == self.address
@@ -138,22 +134,15 @@ class ODriveAxis(SimulatedDrive):
                 kp = gain * self._position_gain
                 self.motor.impede(kp, gain, position, velocity, torque + self._integral, limit)
             else:
-                # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step
-                reach, speed = limit / gain / 2, self.motor.velocity
-                pace = max(speed - reach, min(speed + reach, max(-most, min(most, wanted))))
-                self.motor.impede(0.0, gain, 0.0, pace, torque + self._integral, limit)
+                self.motor.pace(gain, max(-most, min(most, wanted)), torque + self._integral, limit)
 
     # ---- messages
 
-    def pass_time(self, now: float) -> None:
-        super().pass_time(now)
-        for message, instant in self._next.items():
-            if instant <= now + 1e-9:
-                self._next[message] = max(instant + self._periods[message], now)
-                self.tell(partial(self._send_message, message), CARRIED.get(message, ()))
+    def send_cyclic(self, frame: int) -> None:
+        self.tell(partial(self._send_message, frame), CARRIED.get(frame, ()))
 
     def _send_message(self, command: int) -> None:
-        motor, estimated, told = self.motor, "feedback.lost" not in self.faults, self.told()
+        motor, estimated, told = self.motor, "feedback.lost" not in self.faults, self.coded()
         content: dict[int, tuple[float, ...]] = {
             Message.VERSION: (2, 4, 4, 58, 0, 6, 10, 0),
             Message.HEARTBEAT: (self.errors, self.state, 0, 1),
@@ -163,10 +152,8 @@ class ODriveAxis(SimulatedDrive):
             Message.BUS: (BUS_VOLTAGE, 0.5),
         }
         if estimated:
-            position, velocity = told.position / TURN, told.velocity / TURN
-            content[Message.ESTIMATES] = (position / self.scale("position"), velocity / self.scale("velocity"))
-            torque = told.torque / self.scale("torque")
-            content[Message.TORQUES] = (self._input[2], torque)
+            content[Message.ESTIMATES] = (told.position / TURN, told.velocity / TURN)
+            content[Message.TORQUES] = (self._input[2], told.torque)
         values = content.get(command)
         if values is not None:
             self.answer(identifier(self.address, command), pack(Message(command), *values))

@@ -15,11 +15,11 @@ from pydantic import Field, FiniteFloat, model_validator
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
-from armlink.drives.cubemars.frames import MODELS, NO_COMMAND, CubeMarsReply, error_text, unpack_reply
+from armlink.drives.cubemars.frames import MODELS, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
-from armlink.drives.mit_packing import Ranges, Special, grid_of, pack_command, special, unwrap
+from armlink.drives.mit_packing import NO_COMMAND, Ranges, Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
