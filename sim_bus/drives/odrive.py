@@ -12,7 +12,6 @@ from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
-TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1
 """axis0.config.can.heartbeat_msg_rate_ms, by default 100 [s]."""
 TORQUE_CONSTANT = 0.083
@@ -74,17 +73,17 @@ class ODriveAxis(SimulatedDrive):
             ahead = self.scale("torque")
             position, velocity, torque = values
             velocity, torque = velocity * frames.INPUT_FEED_FORWARD, torque * frames.INPUT_FEED_FORWARD
-            self._take_input(position * TURN * self.scale("position"), velocity * TURN, torque * ahead)
+            self._take_input(position * math.tau * self.scale("position"), velocity * math.tau, torque * ahead)
         elif command == Message.INPUT_VELOCITY:
-            self._take_input(self._input[0], values[0] * TURN, values[1] * self.scale("torque"))
+            self._take_input(self._input[0], values[0] * math.tau, values[1] * self.scale("torque"))
         elif command == Message.INPUT_TORQUE:
             self._take_input(self._input[0], 0.0, values[0] * self.scale("torque"))
         elif command == Message.LIMITS and all(math.isfinite(value) and value >= 0 for value in values):
-            self._velocity_limit, self._current_limit = values[0] * TURN, values[1]
+            self._velocity_limit, self._current_limit = values[0] * math.tau, values[1]
         elif command == Message.POSITION_GAIN and math.isfinite(values[0]):
             self._position_gain = values[0]
         elif command == Message.VELOCITY_GAINS and all(math.isfinite(value) for value in values):
-            self._velocity_gain, self._integral_gain = values[0] / TURN, values[1] / TURN
+            self._velocity_gain, self._integral_gain = values[0] / math.tau, values[1] / math.tau
         elif command == Message.CLEAR_ERRORS and not self.latched:
             self.errors = AxisError.MISSING_ESTIMATE if "feedback.lost" in self.faults else 0
 
@@ -152,7 +151,7 @@ class ODriveAxis(SimulatedDrive):
             Message.BUS: (BUS_VOLTAGE, 0.5),
         }
         if estimated:
-            content[Message.ESTIMATES] = (told.position / TURN, told.velocity / TURN)
+            content[Message.ESTIMATES] = (told.position / math.tau, told.velocity / math.tau)
             content[Message.TORQUES] = (self._input[2], told.torque)
         values = content.get(command)
         if values is not None:
