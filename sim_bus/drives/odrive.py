@@ -16,7 +16,7 @@ HEARTBEAT_PERIOD = 0.1
 """axis0.config.can.heartbeat_msg_rate_ms, by default 100 [s]."""
 TORQUE_CONSTANT = 0.083
 """8.27/KV as its user typed it in [N·m/A]."""
-CARRIED = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torque",)}
+CARRIED: dict[int, tuple[str, ...]] = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torque",)}
 """Quantities in its cyclic messages."""
 RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
 
