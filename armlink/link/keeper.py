@@ -100,7 +100,8 @@ def keep(channel: Channel, port: Port, silence: float) -> None:
 
 def _send(port: Port, frames: Sequence[Frame]) -> None:
     with contextlib.suppress(BusFault):  # a bus that is full now may have room the next time
-        port.send_all(frames)
+        for can_id, data in frames:
+            port.send(can_id, data)
 
 
 def main(descriptor: int) -> None:

@@ -101,10 +101,6 @@ class EchoPort:
     def send(self, can_id: int, data: bytes) -> None:
         self._waiting.append((can_id - 1 + _ANSWER, data))
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        for can_id, data in frames:
-            self.send(can_id, data)
-
     def receive(self, timeout: float) -> Frame | None:
         """The next answer, None if there is none; never waits."""
         return self._waiting.popleft() if self._waiting else None

@@ -1,7 +1,5 @@
 """The loop sleeps until the replies should be there, instead of waking for each, and takes those that come later."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from armlink.arm_file import load_arm
@@ -41,10 +39,11 @@ class OneByOne(EchoPort):
         self.overlooked = 0
         """So many last replies come just after they were looked for."""
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        self.sent.append(self.clock.time)
-        self.left = self.clock.time + self.first
-        super().send_all(frames)
+    def send(self, can_id: int, data: bytes) -> None:
+        if can_id == 1:  # the first joint's
+            self.sent.append(self.clock.time)
+            self.left = self.clock.time + self.first
+        super().send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
         if self.overlooked and len(self._waiting) == self.overlooked:
