@@ -83,7 +83,8 @@ def _serve(channel: str, listens: Any) -> None:
             continue
         nodes.put(*frame)
         if nodes.out:
-            port.send_all(nodes.out)
+            for each in nodes.out:
+                port.send(*each)
             nodes.out.clear()
 
 

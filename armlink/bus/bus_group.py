@@ -72,10 +72,6 @@ class GroupPort:
     def send(self, can_id: int, data: bytes) -> None:
         self.members[can_id >> BUS_SHIFT].send(can_id & _ID, data)
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        for index, port in enumerate(self.members):
-            port.send_all([(can_id & _ID, data) for can_id, data in frames if can_id >> BUS_SHIFT == index])
-
     def receive(self, timeout: float) -> Frame | None:
         frame = self._poll(0.0)
         if frame is not None or timeout <= 0:

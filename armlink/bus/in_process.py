@@ -1,7 +1,7 @@
 """Buses inside this process: frames go in by `put` and out by `take`, without blocking."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from armlink.bus.port import Frame, Port
 from armlink.clock import Clock
@@ -56,7 +56,3 @@ class InProcessPort:
     @property
     def dropped(self) -> int:
         return self._bus.dropped
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        for can_id, data in frames:
-            self.send(can_id, data)

@@ -1,7 +1,5 @@
 """Port for any interface of python-can, by message objects."""
 
-from collections.abc import Sequence
-
 import can
 
 from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame, interface_fault
@@ -20,10 +18,6 @@ class MessagePort:
             self._bus.send(as_message(can_id, data, self._fd))
         except Exception as error:
             raise interface_fault(error, self._name, "send") from None
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        for can_id, data in frames:
-            self.send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
         while True:

@@ -2,7 +2,7 @@
 
 import errno
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from armlink.errors import ArmlinkError, BusFault
@@ -48,9 +48,6 @@ class Port(Protocol):
     @property
     def receive(self) -> Callable[[float], Frame | None]:
         """The next frame, or None after a timeout [s] (0: only frames that are there already)."""
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames of a cycle in this order; raises BusFault if the interface cannot take them."""
 
 
 @runtime_checkable

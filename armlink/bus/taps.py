@@ -1,6 +1,6 @@
 """Taps: a bus or port that passes on its traffic, to a frame log or to statistics."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import can
 
@@ -64,13 +64,8 @@ class TappedPort:
         return self._port.dropped
 
     def send(self, can_id: int, data: bytes) -> None:
-        self.send_all(((can_id, data),))
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        now = self._now()
-        for frame in frames:
-            self._tap(now, *frame)
-        self._port.send_all(frames)
+        self._tap(self._now(), can_id, data)
+        self._port.send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
         frame = self._port.receive(timeout)

@@ -57,6 +57,9 @@ class MitCommand(NamedTuple):
     torque: float
 
 
+NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 class MitFeedback(NamedTuple):
     """Position [rad], velocity [rad/s] and torque [N·m] of a reply."""
 

@@ -7,7 +7,7 @@ file, and the host's torque calibration, before an order reaches a family and af
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum
+from enum import Enum, IntEnum, IntFlag
 from typing import NamedTuple
 
 
@@ -124,6 +124,11 @@ class Reading(NamedTuple):
     power: Power | None = None
     fault: str | None = None
     """Fault that the drive reports, in words with its code; empty: it reports that there is none."""
+
+
+def in_words(flags: type[IntFlag], bits: int) -> str:
+    """The flags that are set in `bits`, for Reading.fault; empty where none of them is."""
+    return ", ".join(str(each.name).lower().replace("_", " ") for each in flags if bits & each)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,6 @@ BELIEVED_AGAIN = 0.1
 LEAD_SHARE = 0.05
 """Of the newest cycle in the mean time from a wake to its frames."""
 OFF, POSITION = int(Mode.OFF), int(Mode.POSITION)
-ALWAYS = (OFF, POSITION, int(Mode.TORQUE))
-"""Modes that the set-up has checked; profile modes are checked in each command."""
 
 
 class Commander:

@@ -240,7 +240,9 @@ class Loop:
         board.ask()
         self.watch.syncs += 1
         self.stats.asked += 1
-        self._port.send_all(frames)
+        send = self._port.send
+        for can_id, data in frames:
+            send(can_id, data)
         self.count(len(frames), sum([len(data) for _, data in frames]))
         if self._pass_time is not None:
             self._pass_time(self.period)

@@ -9,12 +9,10 @@ from enum import Enum
 from typing import Protocol
 
 from armlink.errors import BusFault, Refused, Stall
+from armlink.link.cycle import ENABLE_SECONDS
 from armlink.link.park import Parked, cycles, let_down, park
 from armlink.link.types import Tell
 from armlink.termination import Dropped
-
-CATCH_SECONDS = 3.0
-"""Joints that were let go are caught within this time, or not at all [s]: what a walk to power takes at most."""
 
 
 class Response(Enum):
@@ -134,8 +132,8 @@ def _not_parked(link: Ended, tell: Tell) -> str:
 
 
 def _catch(link: Ended) -> None:
-    """Hold the joints, those included that were let go."""
-    for _ in range(cycles(link, CATCH_SECONDS)):
+    """Hold the joints, those included that were let go: within what a walk to power takes at most, or not at all."""
+    for _ in range(cycles(link, ENABLE_SECONDS)):
         link.keep()
         if all(link.commander.held):
             break

@@ -2,16 +2,13 @@
 
 import contextlib
 import itertools
-import socket
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
+from armlink.channel import Closed, start_process
 from armlink.link.ends import EndCause
 from armlink.link.types import Tell
-from armlink.loop.channel import Channel, Closed
 from armlink.loop.driver import Controllers
 from armlink.loop.ending import HANG_SECONDS, see_out
 from armlink.loop.messages import Call, LoopAnswer, Open
@@ -27,13 +24,7 @@ class CycleProcess:
 
     def __init__(self, opening: Open, inherits: Sequence[int] = ()) -> None:
         """Start it; what comes of `opening` it answers. It holds the descriptors that it `inherits` until it ends."""
-        ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
-        self._process = subprocess.Popen(
-            command, pass_fds=[theirs.fileno(), *inherits], stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        theirs.close()
-        self._channel = Channel(ours)
+        self._process, self._channel = start_process(("-m", "armlink.loop.process"), inherits)
         self._channel.put(opening)
         with contextlib.suppress(Closed):  # whoever receives next learns that
             self._channel.flush(HANG_SECONDS)

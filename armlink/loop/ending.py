@@ -7,8 +7,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from armlink.channel import Channel, Closed
 from armlink.link.ends import EndCause
-from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Drop, End, Told
 from armlink.termination import Dropped
 

@@ -7,10 +7,10 @@ from concurrent.futures import Future, InvalidStateError
 from typing import Any
 
 from armlink.arm_file import ArmFile
+from armlink.channel import Closed
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller, Tell
-from armlink.loop.channel import Closed
 from armlink.loop.cycle_process import CycleProcess, numbers
 from armlink.loop.ending import HANG_SECONDS
 from armlink.loop.messages import (

@@ -12,7 +12,6 @@ listen in place of driving (`KeptLoop`).
 import contextlib
 import math
 import pickle
-import socket
 import sys
 import time
 from collections import deque
@@ -25,6 +24,7 @@ from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.bus.listening.joint_messages import silence_of
 from armlink.bus.open import open_link_bus
+from armlink.channel import Channel, Closed, channel_of
 from armlink.errors import ArmlinkError, BusFault, Refused, Stall
 from armlink.link.bus_load import overload
 from armlink.link.ends import EndCause, cause_of
@@ -33,7 +33,6 @@ from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.listener import RESOLUTION, Listener
 from armlink.link.types import Command, Controller, Sample, Setpoints
-from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending, telling
 from armlink.loop.messages import (
     BATCH_SECONDS,
@@ -425,9 +424,9 @@ class KeptLoop(DriveLoop):
 def main(number: int) -> None:
     """Serve the job at the other end of socket `number`; the arm comes to its end, however that comes."""
     ending = Ending()
-    channel = Channel(socket.socket(fileno=number))
+    channel = channel_of(number)
     with contextlib.suppress(Closed):
-        opening = _first(channel)
+        opening: Open = channel.first()
         if opening.log is not None:
             opening.log()
         try:
@@ -453,15 +452,6 @@ def _loop(channel: Channel, opening: Open) -> DriveLoop:
         return DriveLoop(channel, Link.open(opening.arm, opening.bus))
     channel.most = round(UNREAD_SECONDS * opening.arm.require_link().rate)
     return KeptLoop(channel, opening)
-
-
-def _first(channel: Channel) -> Open:
-    while True:
-        channel.wait(1.0)
-        messages = channel.receive()
-        if messages:
-            opening: Open = messages[0]
-            return opening
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.channel import Closed
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause, cause_of
 from armlink.link.park import park
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
-from armlink.loop.channel import Closed
 from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers, remote
 from armlink.loop.driver import ArmDriver
 from armlink.loop.ending import TOLD_EVERY

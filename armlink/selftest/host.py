@@ -3,10 +3,7 @@
 import contextlib
 import os
 import pickle
-import socket
 import struct
-import subprocess
-import sys
 import tempfile
 import time
 from collections import deque
@@ -17,6 +14,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
+from armlink.channel import Channel, Closed, channel_of, start_process
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.base import Ask, BasicDrives, DriveMemory
 from armlink.drives.family import Family
@@ -33,7 +31,6 @@ from armlink.link.joints.groups import Group
 from armlink.link.joints.values import JointValues
 from armlink.link.lateness import Lateness
 from armlink.link.types import Command
-from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import pack
 from armlink.loop.realtime import Realtime, prepare
 
@@ -104,10 +101,6 @@ class EchoPort:
     def send(self, can_id: int, data: bytes) -> None:
         self._waiting.append((can_id - 1 + _ANSWER, data))
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        for can_id, data in frames:
-            self.send(can_id, data)
-
     def receive(self, timeout: float) -> Frame | None:
         """The next answer, None if there is none; never waits."""
         return self._waiting.popleft() if self._waiting else None
@@ -115,12 +108,8 @@ class EchoPort:
 
 def measure_host(arm: ArmFile, seconds: float) -> HostReport:
     """Make cycles in a process of its own, with a job beside it that computes and writes as a sweep does."""
-    ours, theirs = socket.socketpair()
     program = "import sys; from armlink.selftest.host import main; main(int(sys.argv[1]))"
-    command = [sys.executable, "-c", program, str(theirs.fileno())]
-    process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
-    theirs.close()
-    channel = Channel(ours)
+    process, channel = start_process(("-c", program))
     channel.put((arm, seconds))
     channel.flush(5.0)
     try:
@@ -189,10 +178,9 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
 
 def main(number: int) -> None:
     """Measure for the job at the other end of socket `number`."""
-    channel = Channel(socket.socket(fileno=number))
+    channel = channel_of(number)
     with contextlib.suppress(Closed):
-        channel.wait(5.0)
-        ((arm, seconds),) = channel.receive()
+        arm, seconds = channel.first()
         channel.put(cycles(arm, seconds, channel))
         while not channel.flush(1.0):
             channel.receive()

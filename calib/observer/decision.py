@@ -12,7 +12,7 @@ from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.evidence import Verdict
 from gcomp.arrays import Array
-from gcomp.design.sweep_design import MINIMUM_LEVER
+from gcomp.design.selection import MINIMUM_LEVER
 
 AGREEMENT = 13.8
 """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with 2 degrees

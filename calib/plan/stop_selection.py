@@ -7,9 +7,8 @@ import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.selection import select, sweep_jacobian
-from gcomp.design.sweep_design import stop_combinations as limit_poses
-from gcomp.design.sweep_design import sufficient_levers
+from gcomp.design.selection import select, sufficient_levers, sweep_jacobian
+from gcomp.design.selection import stop_combinations as limit_poses
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.parameters import GAIN_STD, POSITION_GAIN_STD, Parameters, free_mask
 

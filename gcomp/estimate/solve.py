@@ -31,13 +31,9 @@ class RobustFit:
     variance: Array
     """Square of the scale of the residuals, (C,)."""
 
-    def robust(self, problem: EstimationProblem) -> Array:
-        """Weight of each row beside the others of its channel by Student's t, (C, N)."""
-        return robust_weight(self.residual, self.variance, problem.freedom)
-
 
 def robust_weight(residual: Array, variance: Array, freedom: float) -> Array:
-    """1 for a row well within the scale and less for one far off, (C, N)."""
+    """Weight of each row beside the others of its channel by Student's t, (C, N): less than 1 for one far off."""
     return (freedom + 1.0) / (freedom + residual**2 / variance[:, None])
 
 

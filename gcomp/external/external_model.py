@@ -178,10 +178,6 @@ class ExternalModel:
     def rows(self, filtered: FilteredRows) -> TorqueRows:
         return rows_of(filtered, self.split, self.joints)
 
-    def model_variance(self, rows: TorqueRows) -> Array:
-        """Of the expected torque (S, n) [N²·m²]."""
-        return model_variance(rows.columns, self.factors)
-
 
 def stride_of(rate: float) -> int:
     return max(1, round(rate / ROWS_RATE))
@@ -195,7 +191,7 @@ def expected(rows: TorqueRows, change: Array) -> Array:
 
 
 def model_variance(columns: Array, factors: Array) -> Array:
-    """Variance (S, n) of what columns (S, n, Q) expect."""
+    """Variance (S, n) of the torque that columns (S, n, Q) expect [N²·m²]."""
     spread = columns.swapaxes(0, 1) @ factors
     return np.asarray(np.einsum("jsq,jsq->sj", spread, spread))
 

@@ -78,21 +78,20 @@ def identify_global(
     unknown: Collection[str],
     start: Parameters | None = None,
     priors: Mapping[str, Prior] | None = None,
-    loss: str = "linear",
     position_sigma: ArrayLike = 0.0,
 ) -> GlobalFit:
     """Estimate the families `unknown` by weighted least squares on the readings that count.
 
     The scale comes from readings with a reference mass or from a prior on the gains. `start` holds the values of known
     families and the first guess of the others (default Parameters.nominal). `position_sigma` () or (n,) [rad] is the
-    noise of position readings, which adds to each reading's variance. `loss` is linear, huber or cauchy. Parameters
-    that the readings do not determine keep the values of the start; all others come out as if those were known.
-    Raises BadArray on wrong shapes and on unknown families and losses.
+    noise of position readings, which adds to each reading's variance. Parameters that the readings do not determine
+    keep the values of the start; all others come out as if those were known. Raises BadArray on wrong shapes and on
+    unknown families.
     """
     readings.require_arm(arm)
     begin = start or _start_of(arm.n, priors or {})
     problem = LeastSquaresProblem.of(
-        arm, readings, unknown, priors or {}, loss, position_sigma, natural_units(arm, readings, begin)
+        arm, readings, unknown, priors or {}, position_sigma, natural_units(arm, readings, begin)
     )
     starts = _starts(problem, begin)
     outcome = solve(problem, next(starts))
@@ -151,7 +150,7 @@ def predict_covariance(
     design.require_arm(arm)
     expected = expected_readings(arm, guess, design)
     problem = LeastSquaresProblem.of(
-        arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
+        arm, expected, unknown, priors or {}, position_sigma, natural_units(arm, expected, guess)
     )
     weight = problem.weights(guess.vector)
     information = analyse(problem.factor(guess.vector, weight)[0], problem.unit[problem.free])

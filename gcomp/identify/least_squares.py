@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
-from gcomp.errors import BadArray
 from gcomp.identify.identifiability import Information, Spectrum, analyse
 from gcomp.identify.parameters import GAIN_STD, POSITION_GAIN_STD, Parameters, Prior, free_mask, prior_vectors
 from gcomp.identify.readings import StaticReadings
@@ -23,8 +22,6 @@ SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
 """Converged if a step can lower the cost by less than the first share of it (a hundredth of that with fixed weights, as
 convergence is then quadratic), or if no step lowers it and the gain expected is below the second share. The third is
 the cost per reading that is rounding alone. Choices: far below the cost's own scatter of √(2/dof)."""
-TUNING = {"huber": 1.345, "cauchy": 2.385}
-"""Residual, in standard deviations, from which a robust loss gives less weight: 95 % efficient on Gaussian noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +33,6 @@ class LeastSquaresProblem:
     free: Mask
     prior_mean: Array
     prior_std: Array
-    loss: str
     position_sigma: Array
     unit: Array
     """Natural units of the parameters (`natural_units`)."""
@@ -48,16 +44,13 @@ class LeastSquaresProblem:
         readings: StaticReadings,
         unknown: Collection[str],
         priors: Mapping[str, Prior],
-        loss: str,
         position_sigma: ArrayLike,
         unit: Array,
     ) -> "LeastSquaresProblem":
-        """Check and convert to vectors; raises BadArray on an unknown loss or family and on wrong shapes."""
-        if loss != "linear" and loss not in TUNING:
-            raise BadArray(f"loss is {loss!r}, expected one of linear, {' or '.join(TUNING)}")
+        """Check and convert to vectors; raises BadArray on an unknown family and on wrong shapes."""
         noise = as_array("position_sigma", np.broadcast_to(position_sigma, (arm.n,)), (arm.n,))
         mean, std = prior_vectors(arm.n, priors)
-        return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
+        return cls(arm, readings, free_mask(arm.n, unknown), mean, std, noise, unit)
 
     def on(self, readings: StaticReadings) -> "LeastSquaresProblem":
         return replace(self, readings=readings)
@@ -75,7 +68,7 @@ class LeastSquaresProblem:
     @property
     def reweighted(self) -> bool:
         """Whether the weights depend on the parameters."""
-        return self.loss != "linear" or bool(self.position_sigma.any())
+        return bool(self.position_sigma.any())
 
     def cost(self, vector: Array, weight: list[Array]) -> float:
         """Weighted sum of squares (priors included) at a parameter vector, with the weights of each block."""
@@ -86,28 +79,17 @@ class LeastSquaresProblem:
             total += float(np.sum((residual * block_weight) ** 2))
         return total
 
-    def weights(self, vector: Array, robust: bool = True) -> list[Array]:
-        """Weight of each counted reading, block by block: 1/σ with position noise, times the loss's root weight."""
+    def weights(self, vector: Array) -> list[Array]:
+        """Weight of each counted reading, block by block: 1/σ with position noise."""
         parameters, weights = Parameters.from_vector(vector, self.arm.n), []
         for block in self.readings.blocks():
             variance = block.sigma[block.counted] ** 2
             if not self.reweighted:
                 weights.append(1 / np.sqrt(variance))
                 continue
-            modelled, _, slope = predict_and_jacobian(self.arm, parameters, block)
-            weight = 1 / np.sqrt(variance + np.sum((slope * self.position_sigma) ** 2, axis=1))
-            size = np.abs(block.torque[block.counted] - modelled) * weight
-            weights.append(weight * np.sqrt(self._loss_weight(size)) if robust else weight)
+            _, _, slope = predict_and_jacobian(self.arm, parameters, block)
+            weights.append(1 / np.sqrt(variance + np.sum((slope * self.position_sigma) ** 2, axis=1)))
         return weights
-
-    def _loss_weight(self, size: Array) -> Array:
-        """ψ(r)/r of the loss at |r| in standard deviations."""
-        if self.loss == "linear":
-            return np.ones_like(size)
-        bound = TUNING[self.loss]
-        if self.loss == "huber":
-            return np.minimum(1.0, bound / np.maximum(size, bound))
-        return 1 / (1 + (size / bound) ** 2)
 
     def _prior_residual(self, vector: Array) -> Array:
         return ((self.prior_mean - vector) / self.prior_std)[self.free]
@@ -186,8 +168,8 @@ def _step(
 
 
 def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, converged: bool) -> Outcome:
-    """Covariance and goodness of fit at the end, from the weights without the loss."""
-    weight = problem.weights(vector, robust=False)
+    """Covariance and goodness of fit at the end."""
+    weight = problem.weights(vector)
     information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
     residual = [
         (block.torque - predict(problem.arm, Parameters.from_vector(vector, problem.arm.n), block))[block.counted]
@@ -195,22 +177,7 @@ def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, converged:
     ]
     scaled = np.concatenate(residual) * np.concatenate(weight)
     dof = len(scaled) - information.rank
-    if problem.loss != "linear":
-        factor = _robust_factor(problem, np.abs(scaled), information.rank)
-        information = replace(information, covariance=information.covariance * factor)
     return Outcome(vector, information, cost, float(scaled @ scaled), dof, converged)
-
-
-def _robust_factor(problem: LeastSquaresProblem, size: Array, rank: int) -> float:
-    """Factor of a robust loss on the covariance: Huber's E[ψ²]/E[ψ']² at the residuals found."""
-    influence = size * problem._loss_weight(size)
-    bound = TUNING[problem.loss]
-    if problem.loss == "huber":
-        slope = (size < bound).astype(np.float64)
-    else:
-        scaled = (size / bound) ** 2
-        slope = (1 - scaled) / (1 + scaled) ** 2
-    return float(np.sum(influence**2) / max(1, len(size) - rank) / np.mean(slope) ** 2)
 
 
 def fold(triangle: Array, rows: Array) -> Array:

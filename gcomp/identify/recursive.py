@@ -28,7 +28,7 @@ class RecursiveFit:
     """Mass moments that were found (2n,)."""
 
 
-def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool = True) -> RecursiveFit:
+def identify_recursive(arm: Arm, readings: StaticReadings) -> RecursiveFit:
     """Mass moments from each joint's own torque, from the last joint to the first; equations (8) to (18) of [MH97].
 
     All readings in which a joint's torque counts are used together, from any number of its sweeps. They must be without
@@ -50,15 +50,11 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
         regressor = gravity_regressor(arm, readings.position[rows])[:, i] * weight[:, None]
         own = slice(2 * i, 2 * i + 2)
         target = readings.torque[rows, i] * weight - regressor[:, 2 * i + 2 :] @ beta[2 * i + 2 :]
-        columns, places = regressor[:, own], [2 * i, 2 * i + 1]
+        columns, places = np.column_stack([regressor[:, own], weight]), [2 * i, 2 * i + 1, 2 * n + i]
         felt = _acting_moments(arm, regressor, weight)
         if not felt[own].all():
             found[own] = False
-            columns, places = columns[:, :0], []
-        if fit_offset:
-            columns, places = np.column_stack([columns, weight]), [*places, 2 * n + i]
-        if not places:
-            continue
+            columns, places = columns[:, 2:], places[2:]
         solver, enough = _solver(columns)
         if not enough:
             raise BadArray(
@@ -66,7 +62,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
                 "over a wider range"
             )
         solution = solver @ target
-        beta[own], offset[i] = (solution[:2] if found[2 * i] else 0.0), (solution[-1] if fit_offset else 0.0)
+        beta[own], offset[i] = (solution[:2] if found[2 * i] else 0.0), solution[-1]
         lever = -solver @ regressor[:, 2 * i + 2 :]
         distal = covariance[2 * i + 2 : 2 * n]
         covariance[places] += lever @ distal

@@ -150,7 +150,8 @@ class ArmServer:
             frames = list(outbox)
             outbox.clear()
             try:
-                self._port.send_all(frames)
+                for can_id, data in frames:
+                    self._port.send(can_id, data)
             except BusFault:  # lost, as on a dead bus
                 self.lost += len(frames)
 

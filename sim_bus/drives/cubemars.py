@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.cubemars.frames import CubeMarsReply, pack_reply
-from armlink.drives.mit_packing import Grid, Special, grid_of, special_of, unpack_command
+from armlink.drives.mit_packing import NO_COMMAND, Grid, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, WrappingDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, WrappingDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""

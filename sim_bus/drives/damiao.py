@@ -21,10 +21,10 @@ from armlink.drives.damiao.frames import (
     pack_value,
     unpack_value,
 )
-from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special_of, unpack_command
+from armlink.drives.mit_packing import NO_COMMAND, Grid, Ranges, Special, grid_of, special_of, unpack_command
 from armlink.errors import BadInput
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, STAGE_TEMPERATURE, WrappingDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, WrappingDrive
 from sim_bus.sim_section import serial_of
 
 LEAST_RANGE = 1e-3

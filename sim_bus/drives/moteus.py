@@ -34,7 +34,6 @@ from sim_bus.drives.simulated_drive import (
 )
 from sim_bus.sim_section import serial_of
 
-TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1
 """servo.default_timeout_s [s]."""
 TIMEOUT_TORQUE = 5.0
@@ -131,12 +130,12 @@ class MoteusDrive(SimulatedDrive):
 
     def _shown_in_cycles(self) -> dict[int, float]:
         """Registers of the reply to a host's usual frame."""
-        position, velocity, torque = self.told()
+        position, velocity, torque = self.coded()
         return {
             MoteusRegister.MODE: self.mode,
-            MoteusRegister.POSITION: position / TURN * self._shown("position"),
-            MoteusRegister.VELOCITY: velocity / TURN * self._shown("velocity"),
-            MoteusRegister.TORQUE: torque * self._shown("torque"),
+            MoteusRegister.POSITION: position / math.tau,
+            MoteusRegister.VELOCITY: velocity / math.tau,
+            MoteusRegister.TORQUE: torque,
             MoteusRegister.TEMPERATURE: STAGE_TEMPERATURE,
             MoteusRegister.FAULT: self.fault_code,
         }
@@ -149,7 +148,7 @@ class MoteusDrive(SimulatedDrive):
             | {
                 MoteusRegister.Q_CURRENT: motor.torque / TORQUE_CONSTANT,
                 0x005: 0.0,
-                0x006: motor.position / TURN,
+                0x006: motor.position / math.tau,
                 0x007: 0.0,
                 MoteusRegister.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
                 0x00B: 1,
@@ -162,9 +161,6 @@ class MoteusDrive(SimulatedDrive):
                 MoteusRegister.SERIAL3: 0,
             }
         )
-
-    def _shown(self, quantity: str) -> float:
-        return 1.0 / self.scale(quantity)
 
     # ---- modes
 
@@ -179,7 +175,7 @@ class MoteusDrive(SimulatedDrive):
             self.heard = self.now
             if self.mode is not MoteusMode.POSITION:
                 self._target, self._integral = self.motor.position, 0.0
-            position = self.command[MoteusRegister.COMMAND_POSITION] * TURN / self._shown("position")
+            position = self.command[MoteusRegister.COMMAND_POSITION] * math.tau * self.scale("position")
             if math.isfinite(position):
                 self._target = position
             self.mode = MoteusMode.POSITION
@@ -193,7 +189,7 @@ class MoteusDrive(SimulatedDrive):
         if self.mode is not MoteusMode.POSITION:
             return
         command, (_, _, integral) = self.command, self._gains
-        velocity = command[MoteusRegister.COMMAND_VELOCITY] * TURN
+        velocity = command[MoteusRegister.COMMAND_VELOCITY] * math.tau
         if math.isfinite(velocity):
             self._target += velocity * duration
         error, most = self._target - self.motor.position, self._torque_limit
@@ -210,7 +206,7 @@ class MoteusDrive(SimulatedDrive):
         command, (stiffness, damping, _) = self.command, self._gains
         kp = max(0.0, min(1.0, command[MoteusRegister.COMMAND_KP_SCALE]))
         kd = max(0.0, min(kp, command[MoteusRegister.COMMAND_KD_SCALE]))
-        velocity, torque = command[MoteusRegister.COMMAND_VELOCITY] * TURN, command[MoteusRegister.COMMAND_TORQUE]
+        velocity, torque = command[MoteusRegister.COMMAND_VELOCITY] * math.tau, command[MoteusRegister.COMMAND_TORQUE]
         ahead = (torque if math.isfinite(torque) else 0.0) * self.scale("torque") + self._integral
         velocity = velocity if math.isfinite(velocity) else 0.0
         self.motor.impede(stiffness * kp, damping * kd, self._target, velocity, ahead, self._torque_limit)

@@ -93,6 +93,12 @@ class Motor:
         self.powered = True
         self._loops.impede(joint, kp * turn * ratio, kd * turn * ratio, level * ratio, limit * abs(ratio))
 
+    def pace(self, kd: float, velocity: float, torque: float, limit: float) -> None:
+        """Make `kd (velocity − dq) + torque` within ±limit [N·m], with a velocity so near to its own that it does not
+        saturate: a drive runs its loop many times in a step of the arm."""
+        reach, now = limit / kd / 2, self.velocity
+        self.impede(0.0, kd, 0.0, max(now - reach, min(now + reach, velocity)), torque, limit)
+
     @property
     def tuned(self) -> tuple[float, float, float]:
         """Stiffness, damping and integral gain of a position loop tuned for this joint, at the drive's output."""

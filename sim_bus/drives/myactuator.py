@@ -100,17 +100,13 @@ class MyActuatorDrive(SimulatedDrive):
         return int(MOTOR_TEMPERATURE + self.motor.heating)
 
     def _state(self, command: int) -> bytes:
-        position, velocity, torque = self.told()
-        values = (
-            torque / self.scale("torque") / self.constant / CENTIAMPERE,
-            velocity / self.scale("velocity") / DEGREE,
-            position / self.scale("position") / DEGREE,
-        )
+        position, velocity, torque = self.coded()
+        values = (torque / self.constant / CENTIAMPERE, velocity / DEGREE, position / DEGREE)
         within = (max(-0x7FFF, min(0x7FFF, round(each))) for each in values)
         return struct.pack("<Bbhhh", command, self._temperature, *within)
 
     def _angle(self) -> bytes:
-        counts = round(self.told().position / self.scale("position") / CENTIDEGREE)
+        counts = round(self.coded().position / CENTIDEGREE)
         return struct.pack("<Ii", 0x92, max(-0x7FFFFFFF, min(0x7FFFFFFF, counts)))
 
     @property
@@ -165,18 +161,15 @@ class MyActuatorDrive(SimulatedDrive):
             motor.impede(0.0, 0.0, 0.0, 0.0, self._torque, self._limit)
         elif self.mode != NO_LOOP:
             self._target += self._speed * duration * (self.mode == SPEED_LOOP)
-            error, speed = self._target - motor.position, motor.velocity
+            error = self._target - motor.position
             wanted = kp * error / kd
             pace = max(-self._most_speed, min(self._most_speed, wanted))
-            change = ki * error if pace == wanted else kp * (pace - speed)
+            change = ki * error if pace == wanted else kp * (pace - motor.velocity)
             self._integral = max(-self._limit, min(self._limit, self._integral + change * duration))
             if pace == wanted:
                 motor.impede(kp, kd, self._target, 0.0, self._integral, self._limit)
             else:
-                # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step
-                reach = self._limit / kd / 2
-                pace = max(speed - reach, min(speed + reach, pace))
-                motor.impede(0.0, kd, 0.0, pace, self._integral, self._limit)
+                motor.pace(kd, pace, self._integral, self._limit)
 
     # ---- faults
 

@@ -12,12 +12,11 @@ from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
-TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1
 """axis0.config.can.heartbeat_msg_rate_ms, by default 100 [s]."""
 TORQUE_CONSTANT = 0.083
 """8.27/KV as its user typed it in [N·m/A]."""
-CARRIED = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torque",)}
+CARRIED: dict[int, tuple[str, ...]] = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torque",)}
 """Quantities in its cyclic messages."""
 RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
 
@@ -41,16 +40,12 @@ class ODriveAxis(SimulatedDrive):
         """Position [rad], velocity [rad/s], torque [N·m]."""
         self._watchdog = link.deadline
         period = max(int(1000 / link.rate + 1e-9), 1) / 1000
-        self._periods = {**RATES, Message.ESTIMATES: period, Message.TORQUES: period}
-        self._next = dict.fromkeys(self._periods, 0.0)
+        for message, each in {**RATES, Message.ESTIMATES: period, Message.TORQUES: period}.items():
+            self.send_every(each, message)
 
     @property
     def patience(self) -> float:
         return self._watchdog
-
-    @property
-    def due(self) -> float:
-        return min(super().due, *self._next.values())
 
     def takes(self, can_id: int) -> bool:
         return (can_id & ~REMOTE) >> 5 == self.address
@@ -78,17 +73,17 @@ class ODriveAxis(SimulatedDrive):
             ahead = self.scale("torque")
             position, velocity, torque = values
             velocity, torque = velocity * frames.INPUT_FEED_FORWARD, torque * frames.INPUT_FEED_FORWARD
-            self._take_input(position * TURN * self.scale("position"), velocity * TURN, torque * ahead)
+            self._take_input(position * math.tau * self.scale("position"), velocity * math.tau, torque * ahead)
         elif command == Message.INPUT_VELOCITY:
-            self._take_input(self._input[0], values[0] * TURN, values[1] * self.scale("torque"))
+            self._take_input(self._input[0], values[0] * math.tau, values[1] * self.scale("torque"))
         elif command == Message.INPUT_TORQUE:
             self._take_input(self._input[0], 0.0, values[0] * self.scale("torque"))
         elif command == Message.LIMITS and all(math.isfinite(value) and value >= 0 for value in values):
-            self._velocity_limit, self._current_limit = values[0] * TURN, values[1]
+            self._velocity_limit, self._current_limit = values[0] * math.tau, values[1]
         elif command == Message.POSITION_GAIN and math.isfinite(values[0]):
             self._position_gain = values[0]
         elif command == Message.VELOCITY_GAINS and all(math.isfinite(value) for value in values):
-            self._velocity_gain, self._integral_gain = values[0] / TURN, values[1] / TURN
+            self._velocity_gain, self._integral_gain = values[0] / math.tau, values[1] / math.tau
         elif command == Message.CLEAR_ERRORS and not self.latched:
             self.errors = AxisError.MISSING_ESTIMATE if "feedback.lost" in self.faults else 0
 
@@ -138,22 +133,15 @@ class ODriveAxis(SimulatedDrive):
                 kp = gain * self._position_gain
                 self.motor.impede(kp, gain, position, velocity, torque + self._integral, limit)
             else:
-                # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step
-                reach, speed = limit / gain / 2, self.motor.velocity
-                pace = max(speed - reach, min(speed + reach, max(-most, min(most, wanted))))
-                self.motor.impede(0.0, gain, 0.0, pace, torque + self._integral, limit)
+                self.motor.pace(gain, max(-most, min(most, wanted)), torque + self._integral, limit)
 
     # ---- messages
 
-    def pass_time(self, now: float) -> None:
-        super().pass_time(now)
-        for message, instant in self._next.items():
-            if instant <= now + 1e-9:
-                self._next[message] = max(instant + self._periods[message], now)
-                self.tell(partial(self._send_message, message), CARRIED.get(message, ()))
+    def send_cyclic(self, frame: int) -> None:
+        self.tell(partial(self._send_message, frame), CARRIED.get(frame, ()))
 
     def _send_message(self, command: int) -> None:
-        motor, estimated, told = self.motor, "feedback.lost" not in self.faults, self.told()
+        motor, estimated, told = self.motor, "feedback.lost" not in self.faults, self.coded()
         content: dict[int, tuple[float, ...]] = {
             Message.VERSION: (2, 4, 4, 58, 0, 6, 10, 0),
             Message.HEARTBEAT: (self.errors, self.state, 0, 1),
@@ -163,10 +151,8 @@ class ODriveAxis(SimulatedDrive):
             Message.BUS: (BUS_VOLTAGE, 0.5),
         }
         if estimated:
-            position, velocity = told.position / TURN, told.velocity / TURN
-            content[Message.ESTIMATES] = (position / self.scale("position"), velocity / self.scale("velocity"))
-            torque = told.torque / self.scale("torque")
-            content[Message.TORQUES] = (self._input[2], torque)
+            content[Message.ESTIMATES] = (told.position / math.tau, told.velocity / math.tau)
+            content[Message.TORQUES] = (self._input[2], told.torque)
         values = content.get(command)
         if values is not None:
             self.answer(identifier(self.address, command), pack(Message(command), *values))

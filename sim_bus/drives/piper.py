@@ -43,20 +43,18 @@ class PiperJoint(SimulatedDrive):
         self._law = (0.0, 0.0, 0.0, 0.0, 0.0)
         """kp, kd, position, velocity, torque of the newest MIT command."""
         self._goal = self._target = self._integral = 0.0
-        self._next = {MOTION_PERIOD: 0.0, STATE_PERIOD: 0.0}
+        self._motion_id, self._state_id = 0x250 + self.number, 0x260 + self.number
+        self.send_every(MOTION_PERIOD, self._motion_id)
+        self.send_every(STATE_PERIOD, self._state_id)
 
     # ---- bus
-
-    @property
-    def due(self) -> float:
-        return min(self._next.values())
 
     def takes(self, can_id: int) -> bool:
         own = (0x155 + (self.number - 1) // 2, 0x159 + self.number)
         return can_id in (0x150, 0x151, 0x471, 0x475, *own) or (can_id == 0x4AF and self.number == min(self.arm))
 
     def sends(self, can_id: int) -> bool:
-        return can_id in (0x250 + self.number, 0x260 + self.number)
+        return can_id in (self._motion_id, self._state_id)
 
     def receive(self, can_id: int, data: bytes) -> None:
         if len(data) != 8:
@@ -98,22 +96,17 @@ class PiperJoint(SimulatedDrive):
 
     # ---- time
 
-    def pass_time(self, now: float) -> None:
-        super().pass_time(now)
-        for period, instant in self._next.items():
-            if instant <= now + 1e-9:
-                self._next[period] = max(instant + period, now)
-                if period == STATE_PERIOD:
-                    self.answer(0x260 + self.number, self._state())
-                else:
-                    self.tell(self._send_motion)
+    def send_cyclic(self, frame: int) -> None:
+        if frame == self._state_id:
+            self.answer(frame, self._state())
+        else:
+            self.tell(self._send_motion)
 
     def _send_motion(self) -> None:
-        _, velocity, torque = self.told()
-        constant = NEWTON_METERS[self.number - 1] / self.amplified
-        values = (velocity / self.scale("velocity"), torque / self.scale("torque") / constant)
+        _, velocity, torque = self.coded()
+        values = (velocity, torque / (NEWTON_METERS[self.number - 1] / self.amplified))
         within = (max(-0x7FFF, min(0x7FFF, round(each / MILLI))) for each in values)
-        self.answer(0x250 + self.number, struct.pack(">hhi", *within, 0))
+        self.answer(self._motion_id, struct.pack(">hhi", *within, 0))
         if self.number == min(self.arm):
             stopped = int(self.stopped)
             self.answer(
@@ -127,7 +120,7 @@ class PiperJoint(SimulatedDrive):
             self.answer(0x2A5 + (first - 1) // 2, struct.pack(">ii", *counts))
 
     def position_counts(self) -> int:
-        counts = round(self.told().position / self.scale("position") / MILLIDEGREE)
+        counts = round(self.coded().position / MILLIDEGREE)
         return max(-MOST_COUNTS, min(MOST_COUNTS, counts))
 
     def _state(self) -> bytes:

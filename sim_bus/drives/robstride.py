@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.mit_packing import Grid, grid_of
+from armlink.drives.mit_packing import NO_COMMAND, Grid, grid_of
 from armlink.drives.robstride.frames import (
     FAULTS,
     IDENTITY_TARGET,
@@ -28,7 +28,7 @@ from armlink.drives.robstride.frames import (
     unpack_value,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, NO_COMMAND, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
 ENCODER_FAULT = 1 << FAULTS.index("encoder")
@@ -71,7 +71,8 @@ class RobStrideDrive(SimulatedDrive):
         self.parameters = dict(self._stored)
         self.mode, self.fault_bits = RunMode.RESET, 0
         self.command = NO_COMMAND
-        self._host, self._reports_at = OUR_ID, math.inf
+        self._host = OUR_ID
+        self._report_from(math.inf)
 
     @property
     def coding(self) -> Grid:
@@ -81,10 +82,6 @@ class RobStrideDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         return self.parameters[RobStrideParameter.TIMEOUT] * TIMEOUT_UNIT
-
-    @property
-    def due(self) -> float:
-        return min(super().due, self._reports_at)
 
     def takes(self, can_id: int) -> bool:
         return bool(can_id & EXTENDED) and not can_id & REMOTE and can_id & 0xFF == self.address
@@ -108,7 +105,7 @@ class RobStrideDrive(SimulatedDrive):
             self.flash_writes += 1
             self._stored = dict(self.parameters)
         elif kind == Type.REPORT:
-            self._reports_at = self.now + REPORT_PERIOD if data[6] == 1 else math.inf
+            self._report_from(self.now + REPORT_PERIOD if data[6] == 1 else math.inf)
         elif kind in (Type.MOTION, Type.ENABLE, Type.STOP, Type.WRITE):
             self._obey(kind, can_id, data)
             self._feed_back(Type.FEEDBACK)
@@ -173,12 +170,12 @@ class RobStrideDrive(SimulatedDrive):
         if math.isfinite(value):
             self.parameters[parameter] = value
 
-    def pass_time(self, now: float) -> None:
-        """See SimulatedDrive; active reports."""
-        super().pass_time(now)
-        if self._reports_at <= now:
-            self._reports_at = max(self._reports_at + REPORT_PERIOD, now)
-            self._feed_back(Type.REPORT)
+    def _report_from(self, instant: float) -> None:
+        """Send active reports from an instant on [s]; infinite: none."""
+        self.send_every(REPORT_PERIOD, Type.REPORT, instant)
+
+    def send_cyclic(self, frame: int) -> None:
+        self._feed_back(frame)
 
     def trip(self) -> None:
         """Mode reset, free; no fault is reported."""
@@ -186,7 +183,8 @@ class RobStrideDrive(SimulatedDrive):
 
     def reboot(self) -> None:
         self.parameters = dict(self._stored)
-        self.fault_bits, self._reports_at, self._host = 0, math.inf, OUR_ID
+        self.fault_bits, self._host = 0, OUR_ID
+        self._report_from(math.inf)
         self._stop()
 
     def change_mode(self, mode: int) -> None:

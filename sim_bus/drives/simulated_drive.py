@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from armlink.bus.port import CLASSICAL
-from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, Ranges
+from armlink.drives.mit_packing import NO_COMMAND, Grid, MitFeedback, Ranges
 from sim_bus.drives.drive_faults import FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.motor import Motor
 
@@ -29,6 +29,8 @@ class SimulatedDrive:
         self.false, self._second = FalseReadings(), False
         """Falsehoods in force; whether the frame that is made now is a second node's."""
         self._send = send
+        self._cyclic: dict[int, tuple[float, float]] = {}
+        """Period and next instant of each frame that it sends by its own clock [s]."""
 
     # ---- bus
 
@@ -65,6 +67,13 @@ class SimulatedDrive:
         pairs = zip(QUANTITIES, true, strict=True)
         return MitFeedback(*(self.false.told(quantity, value, self._second) for quantity, value in pairs))
 
+    def coded(self) -> MitFeedback:
+        """As told(), for a drive that codes in fixed units: with the factors by which its coding differs."""
+        position, velocity, torque = self.told()
+        return MitFeedback(
+            position / self.scale("position"), velocity / self.scale("velocity"), torque / self.scale("torque")
+        )
+
     def tell(self, send: Callable[[], None], quantities: tuple[str, ...] = QUANTITIES) -> None:
         """Send a frame of readings by `send`; once more, where a second node sends in its name."""
         send()
@@ -84,7 +93,8 @@ class SimulatedDrive:
     def due(self) -> float:
         """When the drive next acts by itself [s]."""
         patience = self.patience
-        return self.heard + patience if patience and self.watches else math.inf
+        watchdog = self.heard + patience if patience and self.watches else math.inf
+        return min([watchdog, *(instant for _, instant in self._cyclic.values())])
 
     @property
     def watches(self) -> bool:
@@ -96,6 +106,17 @@ class SimulatedDrive:
         self.motor.pass_time(now)
         if self.watches and self.patience and now - self.heard > self.patience:
             self.trip()
+        for frame, (period, instant) in self._cyclic.items():
+            if instant <= now + 1e-9:
+                self._cyclic[frame] = (period, max(instant + period, now))
+                self.send_cyclic(frame)
+
+    def send_every(self, period: float, frame: int, first: float = 0.0) -> None:
+        """Send a frame each `period` from the instant `first` on [s], by send_cyclic(); never where it is infinite."""
+        self._cyclic[frame] = (period, first)
+
+    def send_cyclic(self, frame: int) -> None:
+        raise NotImplementedError
 
     def postpone(self, seconds: float) -> None:
         """Postpone the watchdog [s], because the simulated arm itself was late."""
@@ -154,9 +175,6 @@ class SimulatedDrive:
         return ranges._replace(
             position=ranges.position * position, velocity=ranges.velocity * velocity, torque=ranges.torque * torque
         )
-
-
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class WrappingDrive(SimulatedDrive):

@@ -13,9 +13,9 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.can_bus import CanBus
+from armlink.channel import Channel
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller
-from armlink.loop.channel import Channel
 from armlink.loop.cycle_process import RemoteControllers
 from armlink.loop.kept_arm import BatchMaker, KeptMessage
 from armlink.loop.messages import Open, RunController

@@ -20,9 +20,9 @@ import numpy as np
 import sqlalchemy as sa
 from fast_daemon import FastDaemon
 
+from armlink.channel import Channel, Closed
 from armlink.errors import BusFault
 from armlink.link.types import Calibration
-from armlink.loop.channel import Channel, Closed
 from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
 from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 READ, WRITE, SYNC_READ, SYNC_WRITE, BULK_READ, STATUS = 0x02, 0x03, 0x82, 0x83, 0x92, 0x55
-BROADCAST = 0xFE
 HEADER_1, HEADER_2 = b"\xff\xff", b"\xff\xff\xfd\x00"
 STUFFED, UNSTUFFED = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
 """A byte is put in where parameters would look like a header (protocol 2.0)."""

@@ -12,7 +12,6 @@ import struct
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
 
 from armlink.bus.port import ERROR, Frame, InterfaceDown, Stamped
 from armlink.errors import BusFault
@@ -80,11 +79,6 @@ class DatagramPort(ABC):
             if tries == _TRIES:
                 raise self._full()
             select.select([], [], [], _RETRY)
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order; raises BusFault as send."""
-        for can_id, data in frames:
-            self.send(can_id, data)
 
     def _full(self) -> BusFault:
         """Nothing could be sent for 50 ms. Where many frames came meanwhile, they had a higher priority."""

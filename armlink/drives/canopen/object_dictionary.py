@@ -95,6 +95,6 @@ HEARTBEAT_ID = 0x700
 SDO_REQUEST_ID, SDO_RESPONSE_ID = 0x600, 0x580
 LSS_ID = 0x7E5
 """Requests of a master that sets node ids and bit rates (CiA 305)."""
-NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET = 0x01, 0x80, 0x81
+NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 OPERATIONAL = 0x05
 NMT_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}

@@ -1,13 +1,13 @@
 """CubeMars AK drives on one bus, in MIT mode: one command and one reply a cycle.
 
-A reply tells no state, so the state here is what was ordered and answered. A drive that makes no torque although its
-commands ask for some has left its motor mode. One that got no command for the link's deadline counts as stopped by its
-CAN timeout, whether it was or not: the timeout is set over the serial port, and nothing on the bus tells it.
+A reply tells no state (`armlink.drives.untold_power`). A drive that makes no torque although its commands ask for some
+has left its motor mode. One that got no command for the link's deadline counts as stopped by its CAN timeout: that is
+set over the serial port, and nothing on the bus tells it.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
@@ -15,15 +15,16 @@ from pydantic import Field, FiniteFloat, model_validator
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
-from armlink.drives.cubemars.frames import MODELS, NO_COMMAND, CubeMarsReply, error_text, unpack_reply
+from armlink.drives.cubemars.frames import MODELS, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
-from armlink.drives.mit_packing import Ranges, Special, grid_of, pack_command, special, unwrap
+from armlink.drives.mit_packing import NO_COMMAND, Ranges, Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
+from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes
 from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(
@@ -32,10 +33,6 @@ TRAITS = Traits(
 """Of a drive with the default keys; with a CAN timeout it lets go."""
 LISTEN = 0.1
 """A drive that answers another host is heard within this time [s]."""
-LOADED = 0.02
-"""Commands that ask for more than this share of the torque range show whether the drive follows them."""
-FOLLOWS = 0.5
-"""A drive that makes less than this share of the torque that is asked for does not follow."""
 
 
 class CubeMarsSettings(DriveSettings):
@@ -93,31 +90,24 @@ class CubeMarsSettings(DriveSettings):
 
 
 @dataclass
-class CubeMarsMemory(MitMemory):
-    on: bool | None = None
-    """In motor mode, by the newest switching that was answered."""
+class CubeMarsMemory(UntoldMemory, MitMemory):
+    """It is on in motor mode, by the newest switching that was answered."""
+
     switched: Special | None = None
     """Newest switching, while it waits for its answer."""
     skip: bool = False
     """The next reply answers a switching that a command follows at once: no reading."""
-    commanded: float = -math.inf
-    """When the newest command was made [s]."""
     lacking: float = math.inf
     """Since when it makes less torque than it is asked for [s]."""
-    stopped: bool = False
-    """It was left without commands for longer than the deadline."""
-    asked: bool = False
-    """The next reply tells whether the newest order is still followed."""
 
 
-class CubeMarsDrives(MitDrives[CubeMarsMemory]):
+class CubeMarsDrives(UntoldPowerDrives[CubeMarsMemory], MitDrives[CubeMarsMemory]):
+    watch = "CAN timeout"
+
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput where one drive's replies have another's id."""
         super().__init__(joints, TRAITS, CubeMarsMemory)
-        self._traits = [
-            replace(traits, silence="falls") if settings.can_timeout else traits
-            for traits, settings in zip(self._traits, self.settings, strict=True)
-        ]
+        self.let_go_where(settings.can_timeout for settings in self.settings)
         for joint, (known, settings) in enumerate(zip(self.memory, self.settings, strict=True)):
             known.grid = grid_of(settings.ranges)
             other = self._joint_of.get(settings.reply)
@@ -190,9 +180,8 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         return self.settings[joint].id, pack_command(NO_COMMAND, self.grid_of(joint))
 
     def follows(self, joint: int, now: float) -> bool:
-        known, deadline = self.memory[joint], self.limits_of(joint).deadline
-        if known.on and now - known.commanded > deadline:
-            known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
+        known = self.memory[joint]
+        self.expire(joint, now, self.limits_of(joint).deadline)
         known.commanded = now if known.on else known.commanded
         return bool(known.on)
 
@@ -228,7 +217,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
             return None
         self._judge(joint, torque, now)
         fault = error_text(reply.error) or self._idle_text(joint, now)
-        power = Power.FAULT if fault else self._power(known)
+        power = Power.FAULT if fault else self.power_shown(joint, known.damping)
         temperature = math.nan if reply.temperature is None else float(reply.temperature)
         return self.note(Reading(joint, position, velocity, torque, math.nan, temperature, power, fault))
 
@@ -238,26 +227,16 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         if known.sent is None:
             return
         wanted = law_torque(known.sent, known.position, known.velocity)
-        shown = abs(wanted) > LOADED * self.grid_of(joint).ranges.torque
-        follows = torque * math.copysign(1.0, wanted) > FOLLOWS * abs(wanted)
-        known.lacking = min(known.lacking, now) if shown and not follows else math.inf
+        follows = makes(torque, wanted, self.grid_of(joint).ranges.torque)
+        known.lacking = min(known.lacking, now) if follows is False else math.inf
         if known.asked:
-            known.asked = False
-            known.on, known.stopped = (follows if shown else None), shown and not follows
+            self.answered(joint, follows)
 
     def _idle_text(self, joint: int, now: float) -> str:
         known = self.memory[joint]
         if known.limits is None or not now - known.lacking > known.limits.deadline:
             return ""
         return "makes no torque although its commands ask for torque: it has left motor mode, or restarted"
-
-    @staticmethod
-    def _power(known: CubeMarsMemory) -> Power:
-        if known.stopped:
-            return Power.STOPPED
-        if known.on:
-            return Power.STOPPED if known.damping else Power.ON
-        return Power.UNKNOWN if known.on is None else Power.OFF
 
     def state_request(self, joint: int) -> list[Frame]:
         """A command of no torque, whose reply has the torque that the drive made until then."""
@@ -267,18 +246,10 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         known.asked = True
         return [self._quiet(joint)]
 
-    def lets_go(self, joint: int) -> bool:
-        return not self.memory[joint].on
-
-    def own_stop(self, joint: int) -> str:
-        if not self.memory[joint].stopped:
-            return ""
-        return f"{self.where(joint)}: no command came within its CAN timeout, so it has switched its torque off"
-
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)
         for known in self.memory:
-            known.stopped, known.lacking = False, math.inf
+            known.lacking = math.inf
 
 
 def _watched(settings: CubeMarsSettings) -> str:

@@ -8,7 +8,7 @@ python-can.
 
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, pack_feedback, unpack_feedback
+from armlink.drives.mit_packing import Grid, MitFeedback, pack_feedback, unpack_feedback
 
 MODELS = {
     "AK10-9": (12.5, 50.0, 65.0),
@@ -32,7 +32,6 @@ ERRORS = {
     5: "encoder",
     6: "phase currents unbalanced",
 }
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class CubeMarsReply(NamedTuple):

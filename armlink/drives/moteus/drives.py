@@ -48,7 +48,6 @@ class MoteusSettings(DriveSettings):
         return f"controller {self.id}"
 
 
-TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
 NOMINAL_BITS, FAST_BITS, FASTER = 60, 40, 5
 """Bits of a CAN FD frame at the nominal rate (29-bit identifier, end) and besides the payload at the fast one, and how
@@ -147,7 +146,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         for joint in range(self.m):
             values = self._ask(ask, joint, {}, (*QUERY, MoteusRegister.HOME_STATE)) or {}
             at_output = values.get(MoteusRegister.HOME_STATE) == HOMED_AT_OUTPUT
-            found.append(values.get(MoteusRegister.POSITION, math.nan) * TURN if at_output else math.nan)
+            found.append(values.get(MoteusRegister.POSITION, math.nan) * math.tau if at_output else math.nan)
         return found
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
@@ -162,14 +161,14 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
                 f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set the output "
                 "position (register 130h), or use an encoder at the output"
             )
-        position = values.get(MoteusRegister.POSITION, math.nan) * TURN
+        position = values.get(MoteusRegister.POSITION, math.nan) * math.tau
         if not math.isfinite(position):
             raise BusFault(f"{name}: its drive reports no position")
         known.limits, known.mode = limits, None
         return Setup(
             position=position,
             torque=0.0,
-            position_step=real32_step(position / TURN) * TURN,
+            position_step=real32_step(position / math.tau) * math.tau,
             modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
             notes=("every command carries the largest torque and the time of the watchdog",),
         )
@@ -218,8 +217,8 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         stiff = float(order.mode == Mode.POSITION)
         return {
             MoteusRegister.MODE: frames.MoteusMode.POSITION,
-            MoteusRegister.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
-            MoteusRegister.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
+            MoteusRegister.COMMAND_POSITION: order.position / math.tau if stiff else math.nan,
+            MoteusRegister.COMMAND_VELOCITY: order.velocity / math.tau if stiff else 0.0,
             MoteusRegister.COMMAND_TORQUE: 0.0 if stiff else real32_within(order.torque, limits.max_torque),
             MoteusRegister.COMMAND_KP_SCALE: stiff,
             MoteusRegister.COMMAND_KD_SCALE: stiff,
@@ -258,8 +257,8 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         return self.note(
             Reading(
                 joint,
-                position * TURN,
-                _finite(values.get(MoteusRegister.VELOCITY, math.nan)) * TURN,
+                position * math.tau,
+                _finite(values.get(MoteusRegister.VELOCITY, math.nan)) * math.tau,
                 _finite(values.get(MoteusRegister.TORQUE, math.nan)),
                 temperature=_finite(values.get(MoteusRegister.TEMPERATURE, math.nan)),
                 power=_power(known),
@@ -318,8 +317,8 @@ def _order_of(data: bytes) -> Order | None:
         power = {0: Power.OFF, 12: Power.STOPPED, 15: Power.STOPPED}.get(int(mode) if math.isfinite(mode) else 0)
         return no_order()._replace(power=power or Power.UNKNOWN)
     stiff = values.get(MoteusRegister.COMMAND_KP_SCALE, 1.0) > 0
-    position = values.get(MoteusRegister.COMMAND_POSITION, math.nan) * TURN
-    velocity = values.get(MoteusRegister.COMMAND_VELOCITY, 0.0) * TURN
+    position = values.get(MoteusRegister.COMMAND_POSITION, math.nan) * math.tau
+    velocity = values.get(MoteusRegister.COMMAND_VELOCITY, 0.0) * math.tau
     torque = values.get(MoteusRegister.COMMAND_TORQUE, 0.0)
     return Order(Power.ON, False, Mode.POSITION if stiff else Mode.TORQUE, position, velocity, torque, 0.0, 0.0)
 

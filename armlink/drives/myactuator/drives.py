@@ -1,15 +1,15 @@
 """MyActuator RMD-X drives on one bus (V3 protocol): a command and a request for the angle a cycle, and their replies.
 
 The reply to a command tells the angle in whole degrees, so it is asked for in steps of 0.01° besides. No reply tells
-whether the motor has power: a drive is on from the first command that it answers. One drive after the other is asked
-for its errors and for the time since its start. A drive that got no command within its time-out has let go, and follows
-the next command at once, so the host counts it as stopped by the time alone.
+whether the motor has power (`armlink.drives.untold_power`). One drive after the other is asked for its errors and for
+the time since its start. A drive that got no command within its time-out has let go, and follows the next command at
+once, so the host counts it as stopped by the time alone.
 """
 
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, model_validator
@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
-from armlink.drives.base import BROADCAST, Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.base import BROADCAST, Ask, no_order
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.myactuator import frames
@@ -26,6 +26,7 @@ from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Rea
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
+from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes
 from armlink.errors import BadInput, BusFault
 
 T = TypeVar("T")
@@ -37,10 +38,6 @@ POLLED = (RmdCommand.ERROR, RmdCommand.RUNTIME)
 LONGEST_PAUSE = 3_600_000
 """A time since the start that has passed by more, in 32 bits, has gone backwards: the drive has restarted. No host goes
 on after it stood still for so long [ms]."""
-LOADED = 0.02
-"""A torque above this share of its limit shows whether the drive still makes it."""
-FOLLOWS = 0.5
-"""A drive that makes less than this share of the torque that it made before does not follow any more."""
 LEAST_GEAR = 6.0
 """Of all models: a constant that is smaller by more than its root is nearer to the motor's than to the output's."""
 
@@ -83,21 +80,13 @@ class MyActuatorSettings(DriveSettings):
 
 
 @dataclass
-class MyActuatorMemory(DriveMemory):
-    on: bool | None = None
-    """Follows its commands, as far as the newest that was answered tells; None: not known."""
+class MyActuatorMemory(UntoldMemory):
     awaited: int = 0
     """The command whose reply says what the drive does from now on."""
-    commanded: float = -math.inf
-    """When the newest command was made [s]."""
     stopping: bool = False
     """It was told to stand still, and has answered."""
-    stopped: bool = False
-    """It was left without commands for longer than its time-out."""
     torque: float = math.nan
     """[N·m]."""
-    asked: bool = False
-    """The next state tells whether it still makes torque."""
     error: int = 0
     runtime: int | None = None
     """Time since its start, as it last told it [ms]."""
@@ -105,14 +94,13 @@ class MyActuatorMemory(DriveMemory):
     cycles: int = 0
 
 
-class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
+class MyActuatorDrives(UntoldPowerDrives[MyActuatorMemory]):
+    watch = "time-out"
+
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput where a CANopen node on the bus would take replies for its own commands."""
         super().__init__(joints, TRAITS, MyActuatorMemory)
-        self._traits = [
-            replace(traits, silence="falls") if settings.timeout_ms else traits
-            for traits, settings in zip(self._traits, self.settings, strict=True)
-        ]
+        self.let_go_where(settings.timeout_ms for settings in self.settings)
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self.settings)}
         self._spare_canopen(arm)
 
@@ -204,8 +192,7 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
     def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
         known = self.memory[joint]
         self.limits_of(joint)
-        if known.on and now - known.commanded > (self.settings[joint].timeout_ms / 1000 or math.inf):
-            known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
+        self.expire(joint, now, self.settings[joint].timeout_ms / 1000 or math.inf)
         known.sent, data = None, request(RmdCommand.STATUS)
         if order.power is Power.ON and known.on:
             known.stopping, data = False, self._command(joint, order)
@@ -262,7 +249,8 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         if command in frames.STATES:
             temperature, current, velocity = frames.unpack_state(data)
             torque = current * self.settings[joint].constant
-            self._judge(joint, torque)
+            if known.asked and known.limits is not None:  # the torque of before shows whether it still makes it
+                self.answered(joint, makes(torque, known.torque, known.limits.max_torque))
             known.velocity, known.torque = velocity, torque
         elif command == RmdCommand.ERROR:
             temperature, known.error = frames.unpack_error(data)
@@ -273,26 +261,8 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         elif command not in (RmdCommand.OFF, RmdCommand.STOP):
             return None
         fault = "has restarted" if known.restarted else frames.error_text(known.error)
-        power = Power.FAULT if fault else self._power(known)
+        power = Power.FAULT if fault else self.power_shown(joint, known.stopping)
         return self.note(Reading(joint, math.nan, velocity, torque, math.nan, temperature, power, fault))
-
-    def _judge(self, joint: int, torque: float) -> None:
-        """Whether a drive that was asked still makes torque, by a reading of it [N·m]."""
-        known = self.memory[joint]
-        if not known.asked or known.limits is None:
-            return
-        known.asked = False
-        shown = abs(known.torque) > LOADED * known.limits.max_torque
-        follows = torque * math.copysign(1.0, known.torque) > FOLLOWS * abs(known.torque)
-        known.on, known.stopped = (follows if shown else None), shown and not follows
-
-    @staticmethod
-    def _power(known: MyActuatorMemory) -> Power:
-        if known.stopped:
-            return Power.STOPPED
-        if known.on:
-            return Power.STOPPED if known.stopping else Power.ON
-        return Power.UNKNOWN if known.on is None else Power.OFF
 
     # ---- states
 
@@ -300,23 +270,13 @@ class MyActuatorDrives(BasicDrives[MyActuatorMemory]):
         self.memory[joint].asked = True
         return [self._frame(joint, request(RmdCommand.STATUS))]
 
-    def lets_go(self, joint: int) -> bool:
-        return not self.memory[joint].on
-
-    def own_stop(self, joint: int) -> str:
-        if not self.memory[joint].stopped:
-            return ""
-        return f"{self.where(joint)}: no command came within its time-out, so it has switched its torque off"
-
     def has_restarted(self, joint: int) -> bool:
         return self.memory[joint].restarted
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)
-        for known in self.memory:
-            known.stopped = False
-            if restarts:
-                known.restarted, known.runtime = False, None
+        for known in self.memory if restarts else ():
+            known.restarted, known.runtime = False, None
 
     def poll(self, first: bool) -> list[Frame]:
         wanted = (RmdCommand.STATUS, RmdCommand.ANGLE)

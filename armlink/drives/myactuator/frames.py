@@ -9,6 +9,8 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
+from armlink.drives.orders import in_words
+
 COMMAND_ID, REPLY_ID = 0x140, 0x240
 """With the drive's id: identifiers of commands to it and of its replies."""
 ALL_ID, SET_ID, MOTION_ID = 0x280, 0x300, 0x400
@@ -174,7 +176,4 @@ def timeout_command(milliseconds: int) -> bytes:
 
 def error_text(error: int) -> str:
     """Errors in words, with their number; empty: none."""
-    if not error:
-        return ""
-    names = ", ".join(str(each.name).lower().replace("_", " ") for each in RmdError if error & each)
-    return f"{names or 'unknown'} (error {error:04X}h)"
+    return f"{in_words(RmdError, error) or 'unknown'} (error {error:04X}h)" if error else ""

@@ -53,7 +53,6 @@ class ODriveSettings(DriveSettings):
         return f"node {self.node}"
 
 
-TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="cyclic", frame="11")
 FROM_DRIVE = (
     Message.VERSION, Message.HEARTBEAT, Message.ERROR, Message.ESTIMATES, Message.CURRENT, Message.TEMPERATURE,
@@ -173,7 +172,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         return Setup(
             position=known.position,
             torque=0.0,
-            position_step=real32_step(known.position / TURN) * TURN,
+            position_step=real32_step(known.position / math.tau) * math.tau,
             modes=frozenset(modes),
             lost=lost,
             notes=("watchdog, current limit and torque constant are set over USB and cannot be read over CAN",),
@@ -222,7 +221,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
             data = pack(message, real32_within(_checked(order.torque), limits.max_torque))
         else:
             control, message = POSITION_CONTROL, Message.INPUT_POSITION
-            data = frames.input_position(_checked(order.position) / TURN, _checked(order.velocity) / TURN, 0.0)
+            data = frames.input_position(_checked(order.position) / math.tau, _checked(order.velocity) / math.tau, 0.0)
         told = _order_of(message, data)
         assert told is not None
         self.memory[joint].sent = told._replace(power=order.power)
@@ -264,8 +263,8 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
             position, velocity = values
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
-            known.position = position * TURN
-            return Reading(joint, known.position, velocity * TURN)
+            known.position = position * math.tau
+            return Reading(joint, known.position, velocity * math.tau)
         if message == Message.TORQUES and known.requested:
             known.requested -= 1
         elif message == Message.TORQUES and math.isfinite(values[1]):
@@ -338,7 +337,7 @@ def _order_of(message: int, data: bytes) -> Order | None:
     if message == Message.INPUT_POSITION:
         position, velocity, torque = values
         return Order(
-            Power.ON, False, Mode.POSITION, position * TURN, velocity * INPUT_FEED_FORWARD * TURN,
+            Power.ON, False, Mode.POSITION, position * math.tau, velocity * INPUT_FEED_FORWARD * math.tau,
             torque * INPUT_FEED_FORWARD, 0.0, 0.0,
         )  # fmt: skip
     return None

@@ -8,6 +8,8 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
+from armlink.drives.orders import in_words
+
 
 class Message(IntEnum):
     """Command number: low five bits of the identifier."""
@@ -129,10 +131,7 @@ def heartbeat(data: bytes) -> Heartbeat | None:
 
 
 def error_names(bits: int) -> str:
-    return (
-        ", ".join(str(error.name).lower().replace("_", " ") for error in AxisError if bits & error)
-        or f"unknown ({bits:#x})"
-    )
+    return in_words(AxisError, bits) or f"unknown ({bits:#x})"
 
 
 def input_position(position: float, velocity: float, torque: float) -> bytes:

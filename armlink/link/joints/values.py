@@ -108,7 +108,7 @@ class JointValues:
         return self._zeros[joint]
 
     def turn_zero(self, joint: int, turns: int) -> None:
-        self._zeros[joint] += 2 * math.pi * turns
+        self._zeros[joint] += math.tau * turns
         self._place_zeros()
 
     def gains(self, joint: int, gains: Gains | None) -> Gains | None:

@@ -24,8 +24,6 @@ from armlink.link.joints.values import JointValues
 if TYPE_CHECKING:
     from armlink.link.cycle import Commander
 
-TURN = 2 * math.pi
-"""At the drive's output [rad]."""
 MOST_NAMED = 4
 """So many zeros are named where several fit."""
 MOST_CYCLES = 250
@@ -69,7 +67,7 @@ class Misplacement:
         listed = " or ".join(zeros)
         if len(zeros) > MOST_NAMED:
             ends = " to ".join(f"`zero: {self.zero_after(turns)}`" for turns in (min(self.turns), max(self.turns)))
-            listed = f"{zeros[0]} or another value of {ends}, in steps of {TURN:.4f},"
+            listed = f"{zeros[0]} or another value of {ends}, in steps of {math.tau:.4f},"
         chosen = ", so `turns: auto` cannot choose" if self.automatic else ""
         return (
             f"Several numbers of whole turns of its drive explain this reading{chosen}: find out which number is "
@@ -89,7 +87,7 @@ class Misplacement:
 
     def zero_after(self, turns: int) -> str:
         """The zero that differs by so many turns, as one writes it in the arm file."""
-        return f"{self.zero + TURN * turns + 0.0:.4f}".replace("-0.0000", "0.0000")
+        return f"{self.zero + math.tau * turns + 0.0:.4f}".replace("-0.0000", "0.0000")
 
     def __str__(self) -> str:
         return f"{self.name}: {self.what}. {self.remedy}"
@@ -129,8 +127,8 @@ class WholeTurns:
         if not math.isfinite(reading):
             return ()
         gear, direction = self._values.gear[joint], self._values.direction[joint]
-        least = math.ceil((reading - self._upper[joint]) / (TURN / gear))
-        most = math.floor((reading - self._lower[joint]) / (TURN / gear))
+        least = math.ceil((reading - self._upper[joint]) / (math.tau / gear))
+        most = math.floor((reading - self._lower[joint]) / (math.tau / gear))
         lost = sorted(range(least, most + 1), key=lambda turns: (turns % gear != 0, abs(turns)))
         return tuple(int(direction) * turns for turns in lost)
 
@@ -138,7 +136,7 @@ class WholeTurns:
         """Joints whose range is so wide that a lost turn may leave the reading between the stops; that turn [rad]."""
         found = []
         for joint, (lower, upper) in enumerate(self._stops):
-            turn = TURN / float(self._values.gear[joint])
+            turn = math.tau / float(self._values.gear[joint])
             if lower + turn <= self._upper[joint] or upper - turn >= self._lower[joint]:
                 found.append((joint, turn))
         return found
@@ -177,7 +175,7 @@ class WholeTurns:
         stated, used = self._joints[joint].settings.zero, self._values.zero_of(joint)
         if stated == used:
             return ""
-        turns = round((used - stated) / TURN)
+        turns = round((used - stated) / math.tau)
         return f"zero {used:.4f} is used instead of {stated:g}, {_in_words(turns)} (`turns: auto`)"
 
 
@@ -237,7 +235,7 @@ class PlaceWatch:
                 positions = positions.copy()
                 for each in corrected:
                     gear, direction = self._values.gear[each.joint], self._values.direction[each.joint]
-                    positions[each.joint] -= direction * TURN * each.turns[0] / gear
+                    positions[each.joint] -= direction * math.tau * each.turns[0] / gear
         found = {each.joint: each for each in self._turns.misplaced(positions)}
         for joint, each in found.items():
             if joint not in self.found:

@@ -43,7 +43,8 @@ def raw(can_id, data=b""):
 
 def test_frames_go_out_and_in_in_order(pair):
     port = SocketPort(pair.socket, "pair")
-    port.send_all([(0x200 + i, bytes([i] * i)) for i in range(9)])
+    for each in [(0x200 + i, bytes([i] * i)) for i in range(9)]:
+        port.send(*each)
     assert [pair.other.recv(100) for _ in range(9)] == [raw(0x200 + i, bytes([i] * i)) for i in range(9)]
     for i in range(9):
         pair.other.send(raw(0x180 + i, bytes([i] * i)))
@@ -72,7 +73,8 @@ def test_many_frames_all_leave_in_order(pair):
 
     reader = threading.Thread(target=take_all, daemon=True)
     reader.start()
-    port.send_all(frames)
+    for each in frames:
+        port.send(*each)
     reader.join(30)
     assert sent == [raw(can_id, data) for can_id, data in frames]
 
@@ -147,7 +149,8 @@ def test_a_full_transmit_queue_is_waited_for_then_said(pair, monkeypatch):
         return real(datagram, flags)
 
     port._send = send
-    port.send_all([(1, b"a"), (2, b"b"), (3, b"c")])
+    for each in [(1, b"a"), (2, b"b"), (3, b"c")]:
+        port.send(*each)
     assert [pair.other.recv(100) for _ in range(3)] == [raw(1, b"a"), raw(2, b"b"), raw(3, b"c")]
     refusals[0] = 1000
     with pytest.raises(BusFault, match="transmit queue stays full: does any node acknowledge"):
@@ -214,7 +217,8 @@ def test_frames_go_to_the_bus_that_their_identifier_names_and_come_back_with_it(
     ):
         port = group.open_port()
         assert isinstance(port, GroupPort)
-        port.send_all([(0x201, b"1"), (0x201 | wrist_tag, b"3"), (0x80, b""), (0x80 | wrist_tag, b"")])
+        for each in [(0x201, b"1"), (0x201 | wrist_tag, b"3"), (0x80, b""), (0x80 | wrist_tag, b"")]:
+            port.send(*each)
         port.send(0x000, b"\x01\x00")
         port.send(0x603 | wrist_tag, b"x")
         heard = {bus: [] for bus in (base, wrist)}

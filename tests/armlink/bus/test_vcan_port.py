@@ -25,7 +25,8 @@ def test_a_slow_reader_knows_how_many_frames_it_lost():
         sending, reading = sender.open_port(), reader.open_port()
         sent = 0
         while sent < 400 * len(CYCLE):
-            sending.send_all(CYCLE)
+            for each in CYCLE:
+                sending.send(*each)
             sent += len(CYCLE)
         taken = 0
         while reading.receive(0.0) or reading.receive(0.01):
@@ -49,7 +50,8 @@ def test_two_buses_one_of_them_can_fd_are_one(arm_of):
     ):
         port = group.open_port()
         tag = group.tags["hand"]
-        port.send_all([(0x201, b"one"), (0x80, b""), (tag | 0x202, b"two"), (tag | 0x80, b"")])
+        for each in [(0x201, b"one"), (0x80, b""), (tag | 0x202, b"two"), (tag | 0x80, b"")]:
+            port.send(*each)
         heard = {bus: [bus.recv(1.0), bus.recv(1.0)] for bus in (base, hand)}
         assert [m.arbitration_id for m in heard[base]] == [0x201, 0x80]
         assert [(m.arbitration_id, m.is_fd, m.bitrate_switch) for m in heard[hand]] == [

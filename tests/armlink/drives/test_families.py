@@ -239,7 +239,7 @@ def test_moteus_needs_can_fd_and_a_referenced_output():
 def test_odrive_without_torque_messages_says_what_is_lost():
     bench = Bench("six-odrive")
     for device in bench.simulated:
-        device._next.pop(odrive.Message.TORQUES)
+        device._cyclic.pop(odrive.Message.TORQUES)
     bench.arm.outbox.clear()
     found = bench.set_up()
     assert found[0].modes == {Mode.POSITION}
@@ -248,7 +248,7 @@ def test_odrive_without_torque_messages_says_what_is_lost():
 
 def test_odrive_that_sends_no_estimates():
     bench = Bench("six-odrive")
-    bench.simulated[0]._next.pop(odrive.Message.ESTIMATES)
+    bench.simulated[0]._cyclic.pop(odrive.Message.ESTIMATES)
     bench.arm.outbox.clear()
     with pytest.raises(BusFault, match="base: node 1 sends no encoder estimates"):
         bench.set_up()

@@ -13,6 +13,7 @@ from armlink.drives.myactuator.frames import CURRENT, RmdCommand, request
 from armlink.drives.orders import Mode, Power
 from armlink.errors import BadInput, BusFault
 from sim_bus.drives.fronts import simulated_families
+from sim_bus.drives.motor import Motor
 
 
 def hexed(text):
@@ -69,6 +70,7 @@ class Still:
     position, velocity = math.radians(45), 0.0
     torque = 10.0 / 3.2
     tuned = (40.0, 4.0, 100.0)
+    pace = Motor.pace
 
     def __init__(self):
         self.laws = []

@@ -84,13 +84,15 @@ def test_an_arm_afloat_is_held_although_the_frames_of_one_cycle_are_lost(name):
         here = bench.link.latest_position
         torque = np.clip(bench.sim.gravity_torque(here[None])[0], -limits, limits)
         bench.link.cycle(Command(np.full(6, Mode.TORQUE, np.int8), torque, here))
-    port = bench.link.commander.loop._port
-    send_all = port.send_all
+    loop = bench.link.commander.loop
+    encode = loop._encode
 
-    def lost(frames):
-        port.send_all = send_all
+    def lost(*of):
+        loop._encode = encode
+        encode(*of)
+        return []
 
-    port.send_all = lost
+    loop._encode = lost
     bench.peak[:] = 0.0
     bench.leave(None)
     assert not any(bench.powered)

@@ -1,7 +1,5 @@
 """A host that stands still at any line of a cycle is called late; the joints' own stops are put down to it."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from fake_joints import FakeClock
@@ -33,10 +31,11 @@ class StandingStill(EchoPort):
                 self._waiting.append(FIRST_STOPPED)
             self.still = 0.0
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
+    def send(self, can_id: int, data: bytes) -> None:
         self.stand_still("before SYNC")
-        super().send_all(frames)
-        self.stand_still("after SYNC")
+        super().send(can_id, data)
+        if can_id == len(self.standing):  # the last joint's
+            self.stand_still("after SYNC")
 
     def receive(self, timeout: float) -> Frame | None:
         if self._waiting:

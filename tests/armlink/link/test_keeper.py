@@ -1,6 +1,7 @@
 """The keeper: when it sends what its host told it, when it does not, and how a host learns of it."""
 
 import os
+import pickle
 import signal
 import socket
 import threading
@@ -12,9 +13,10 @@ import pytest
 
 from armlink.arm_file import Bus, LinkSection, load_arm
 from armlink.bus.port import EXTENDED
+from armlink.channel import Channel
 from armlink.errors import BusFault, Refused
 from armlink.link import keeper
-from armlink.link.keeper import Keeper, keep, unpack_frames
+from armlink.link.keeper import Keeper, keep
 from armlink.link.link import Link
 from sim_bus.bus.lock_step import LockStepBus
 
@@ -27,10 +29,11 @@ class Host:
     """A host's end of the channel, and what its keeper has sent."""
 
     def __init__(self, silence):
-        self.channel, theirs = socket.socketpair()
+        self.socket, theirs = socket.socketpair()
+        self.channel = Channel(self.socket)
         self.sent = []
-        port = SimpleNamespace(send_all=lambda frames: self.sent.append(list(frames)))
-        self.thread = threading.Thread(target=keep, args=(theirs, port, silence), daemon=True)
+        port = SimpleNamespace(send=lambda *frame: self.sent.append(frame))
+        self.thread = threading.Thread(target=keep, args=(Channel(theirs), port, silence), daemon=True)
         self.thread.start()
         self.keeper = Keeper.__new__(Keeper)
         self.keeper.__dict__.update(_channel=self.channel, lost=False, heard=False, _told=keeper.deque(maxlen=4))
@@ -54,15 +57,16 @@ def test_a_host_that_dies_leaves_its_newest_frames():
     host.renew([(1, b"old")])
     host.renew()
     host.dies()
-    assert host.sent == [HOLD] * keeper.SENDINGS
+    assert host.sent == HOLD * keeper.SENDINGS
 
 
 def test_a_host_that_stands_still_is_replaced_until_it_goes_on():
     host = Host(silence=0.05)
     host.renew()
-    assert host.until(keeper.SENDINGS) == [HOLD] * keeper.SENDINGS
+    held = HOLD * keeper.SENDINGS
+    assert host.until(len(held)) == held
     host.renew([(2, b"new")])
-    assert host.until(keeper.SENDINGS + 1)[keeper.SENDINGS] == [(2, b"new")]
+    assert host.until(len(held) + 1)[len(held)] == (2, b"new")
     host.dies()
 
 
@@ -71,23 +75,24 @@ def test_a_host_whose_drives_have_no_power_leaves_nothing():
     host.renew()
     host.renew([])
     host.dies()
-    assert [frames for frames in host.sent if frames] == []
+    assert host.sent == []
 
 
 def test_a_message_that_came_in_pieces_or_never_whole():
-    host, body = Host(silence=3600.0), keeper.HEAD.pack(7, 2) + b"ab"
-    message = keeper.LENGTH.pack(len(body)) + body
+    host = Host(silence=3600.0)
+    body = pickle.dumps([(7, b"ab")])
+    message = len(body).to_bytes(4, "little") + body
     for byte in message + message[:-1]:
-        host.channel.send(bytes([byte]))
+        host.socket.send(bytes([byte]))
         time.sleep(0.001)
     host.dies()
-    assert host.sent == [[(7, b"ab")]] * keeper.SENDINGS
-    assert unpack_frames(b"") == []
+    assert host.sent == [(7, b"ab")] * keeper.SENDINGS
 
 
 def test_a_keeper_that_ended_is_a_fault_once():
     host = Host(silence=3600.0)
-    host.keeper._channel, other = socket.socketpair()
+    ours, other = socket.socketpair()
+    host.keeper._channel = Channel(ours)
     other.close()
     with pytest.raises(BusFault, match="the keeper of this host has ended"):
         host.renew()

@@ -88,7 +88,8 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
                 frame = port.receive(0.05)
                 if frame is not None:
                     nodes.put(*frame)
-                    port.send_all(nodes.out)
+                    for each in nodes.out:
+                        port.send(*each)
                     nodes.out.clear()
 
     thread = threading.Thread(target=serve)

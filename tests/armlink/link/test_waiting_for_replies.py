@@ -1,7 +1,6 @@
 """The loop sleeps until the replies should be there, instead of waking for each, and takes those that come later."""
 
 import struct
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -47,10 +46,11 @@ class OneByOne(EchoPort):
         self.overlooked = 0
         """So many last replies come just after they were looked for."""
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        self.sent.append(self.clock.time)
-        self.left = self.clock.time + self.first
-        super().send_all(frames)
+    def send(self, can_id: int, data: bytes) -> None:
+        if can_id == 1:  # the first joint's
+            self.sent.append(self.clock.time)
+            self.left = self.clock.time + self.first
+        super().send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
         if self.overlooked and len(self._waiting) == self.overlooked:
@@ -192,25 +192,22 @@ class Behind(EchoPort):
     def __init__(self, clock: WaitedFor, seed: int, stalls: float) -> None:
         super().__init__(load_arm("sarcos"))
         self.clock, self.random, self.stalls = clock, np.random.default_rng(seed), stalls
-        self.commands, self.free = 0, 0.0
+        self.free = 0.0
         self.taken: list[float] = []
         """When the reply to each command was made, by the number of the command."""
         self.lost: set[int] = set()
         self.coming: list[tuple[float, Frame]] = []
 
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        number, now = self.commands, self.clock.time
-        self.commands += 1
-        stalls = self.random.random() < self.stalls
-        self.free = max(self.free, now + self.random.uniform(1e-4, 0.02 if stalls else 1e-3))
-        self.taken.append(self.free)
-        if number in self.lost:
-            return
-        for can_id, _ in frames:
+    def send(self, can_id: int, data: bytes) -> None:
+        if can_id == 1:  # to the first joint: another command
+            stalls = self.random.random() < self.stalls
+            self.free = max(self.free, self.clock.time + self.random.uniform(1e-4, 0.02 if stalls else 1e-3))
+            self.taken.append(self.free)
+            self.coming.append((self.free + self.random.uniform(0.0, 3e-3), (0x7F0, b"")))
+        number = len(self.taken) - 1
+        if number not in self.lost:
             self.free += 2e-5
-            reply = struct.pack("<ff", number * STEP, 0.0)
-            self.coming.append((self.free, (can_id - 1 + 0x100, reply)))
-        self.coming.append((self.free + self.random.uniform(0.0, 3e-3), (0x7F0, b"")))
+            self.coming.append((self.free, (can_id - 1 + 0x100, struct.pack("<ff", number * STEP, 0.0))))
         self.coming.sort(key=lambda each: each[0])
 
     def receive(self, timeout: float) -> Frame | None:

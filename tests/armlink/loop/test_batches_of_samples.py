@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from fake_joints import FakeBus, make_arm
 
+from armlink.channel import Channel
 from armlink.link.link import Link
 from armlink.link.types import Setpoints
 from armlink.loop import process
-from armlink.loop.channel import Channel
 from armlink.loop.messages import Call, Play
 
 ROWS, PERIOD = 9, 0.004

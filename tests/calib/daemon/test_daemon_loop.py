@@ -21,12 +21,12 @@ from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.listening.joint_messages import JointStateMessage, ListeningBus
 from armlink.bus.open import open_link_bus
+from armlink.channel import Channel
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command, Sample, Stats
 from armlink.loop import process
-from armlink.loop.channel import Channel
 from armlink.loop.kept_arm import BatchMaker, KeptArm
 from armlink.loop.messages import Batch, Call, Down, Health, LoopAnswer, Told, Up, pack
 from armlink.loop.process import UNREAD_SECONDS

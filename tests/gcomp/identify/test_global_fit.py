@@ -1,4 +1,6 @@
-"""The global fit: exact Jacobian, exact without noise, robust start, honest intervals, outliers."""
+"""The global fit: exact Jacobian, exact without noise, robust start, honest intervals."""
+
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -163,25 +165,6 @@ def test_position_noise_widens_the_intervals_to_what_happens(sarcos) -> None:
     assert np.std(naive) > 2
 
 
-@pytest.mark.sample(1)
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_robust_loss_survives_outliers_with_honest_intervals(loss: str, sarcos) -> None:
-    rng = np.random.default_rng(11)
-    true = truth(rng, positions=False)
-    positions, marks = sweep_rows(sarcos, 2, 13, rng)
-    scores = []
-    for _ in range(3):
-        rows = make_readings(sarcos, true, positions, marks, loads=(0.0, 2.0), rng=rng)
-        torque = rows.torque + np.where(rng.random(rows.torque.shape) < 0.03, 3.0, 0.0)
-        spoilt = StaticReadings(rows.position, torque, rows.sigma, rows.load)
-        found = identify_global(sarcos, spoilt, unknown=("gain", "offset", "beta", "rho"), loss=loss)
-        known = found.std.vector > 0
-        scores.append((found.values.vector - true.vector)[known] / found.std.vector[known])
-    assert 0.6 < np.std(scores) < 1.5
-    plain = identify_global(sarcos, spoilt, unknown=("gain", "offset", "beta", "rho"))
-    assert errors(found.values, true).max() < errors(plain.values, true).max()
-
-
 def test_gain_prior_gives_the_scale_where_there_is_no_mass(sarcos) -> None:
     """The ratios come from the readings, the scale from the prior: 3 % over √7 gains."""
     rng = np.random.default_rng(5)
@@ -232,8 +215,6 @@ def test_wrong_names_and_shapes_are_refused(sarcos, rng) -> None:
     rows = make_readings(sarcos, Parameters.nominal(7), *sweep_rows(sarcos, 1, 3, rng))
     with pytest.raises(BadArray, match=r"unknown is .*'gains'.*, expected some of gain, offset"):
         identify_global(sarcos, rows, unknown=("gains",))
-    with pytest.raises(BadArray, match="loss is 'tukey', expected one of linear, huber or cauchy"):
-        identify_global(sarcos, rows, unknown=("beta",), loss="tukey")
     with pytest.raises(BadArray, match="the readings have 7 joints, but the arm has 3"):
         identify_global(make_random_arm(rng, 3).arm, rows, unknown=("beta",))
     with pytest.raises(BadArray, match="std of the prior on gain is -1"):
@@ -266,3 +247,13 @@ def test_columns_that_are_zero_but_for_rounding_do_not_run_away() -> None:
     found = identify_global(arm, rows, unknown=FAMILIES, priors=prior)
     assert found.values.gain[1:] == pytest.approx([0.87, 1.04], abs=1e-6)
     assert abs(found.complete.rho[2]) < 1
+
+
+def test_ten_thousand_samples_are_fitted_in_bounded_memory(sarcos, rng) -> None:
+    q = rng.uniform(sarcos.lower, sarcos.upper, (10_000, 7))
+    true = Parameters.nominal(7, beta=SARCOS_BETA, offset=np.linspace(-1, 1, 7))
+    rows = make_readings(sarcos, true, q, np.zeros_like(q), sigma=0.05)
+    tracemalloc.start()
+    identify_global(sarcos, rows, unknown=("offset", "beta"))
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()

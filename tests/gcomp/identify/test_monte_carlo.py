@@ -7,7 +7,7 @@ import pytest
 from gravity_rig import SARCOS_BETA, make_readings, make_sarcos
 
 from gcomp.arrays import Array
-from gcomp.design.sweep_design import stop_combinations
+from gcomp.design.selection import stop_combinations
 from gcomp.gravity.torque import gravity_regressor, torque_covariance
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.linear_start import linear_start

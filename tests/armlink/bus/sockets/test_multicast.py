@@ -164,7 +164,8 @@ def drain(port, wait=0.2):
 
 @pytest.mark.parametrize("length", [0, 1, 8, 12, 64])
 def test_python_can_hears_what_a_port_sends(port, stock, length):
-    port.send_all([(can_id, bytes(range(length))) for can_id in (0x00, 0x80, 0x181, 0x7FF)])
+    for each in [(can_id, bytes(range(length))) for can_id in (0x00, 0x80, 0x181, 0x7FF)]:
+        port.send(*each)
     heard = [stock.recv(1.0) for _ in range(4)]
     assert [each.arbitration_id for each in heard] == [0x00, 0x80, 0x181, 0x7FF]
     for each in heard:
@@ -224,14 +225,16 @@ def test_own_frames_are_left_out_and_equal_ones_of_others_are_not(port, stock):
 def test_two_ports_hear_each_other_but_not_themselves(port):
     with open_member() as bus:
         other = bus.open_port()
-        port.send_all([(0x80, b""), (0x201, b"a")])
+        for each in [(0x80, b""), (0x201, b"a")]:
+            port.send(*each)
         other.send(0x181, b"b")
         assert drain(other) == [(0x80, b""), (0x201, b"a")]
         assert drain(port) == [(0x181, b"b")]
 
 
 def test_a_wait_lasts_its_time_whatever_echoes_come_meanwhile(port):
-    port.send_all([(0x80, b"")] * 40)
+    for each in [(0x80, b"")] * 40:
+        port.send(*each)
     start = time.monotonic()
     assert port.receive(0.1) is None
     assert time.monotonic() - start >= 0.1
@@ -241,7 +244,8 @@ def test_many_frames_pass(port):
     with open_member() as bus:
         other = bus.open_port()
         frames = [(can_id, bytes([can_id & 0xFF])) for can_id in range(197)]
-        port.send_all(frames)
+        for each in frames:
+            port.send(*each)
         assert drain(other) == frames
 
 
@@ -255,10 +259,12 @@ def test_a_node_answers_in_frames_as_it_hears(member, stock):
     port = member.open_port(as_node=True)
     stock.send(message(0x601, b"classic"))
     assert port.receive(1.0) == (0x601, b"classic")
-    port.send_all([(0x581, b"1"), (0x20000008, bytes(8))])
+    for each in [(0x581, b"1"), (0x20000008, bytes(8))]:
+        port.send(*each)
     stock.send(message(0x601, b"fd", fd=True))
     assert port.receive(1.0) == (0x601, b"fd")
-    port.send_all([(0x581, b"2"), (0x20000008, bytes(8))])
+    for each in [(0x581, b"2"), (0x20000008, bytes(8))]:
+        port.send(*each)
     heard = [each for each in (stock.recv(1.0) for _ in range(6)) if each.arbitration_id != 0x601]  # its own echoes
     assert [(each.is_fd, each.is_error_frame) for each in heard] == [
         (False, False),
@@ -295,7 +301,8 @@ def test_a_full_queue_counts_what_it_lost(port):
     with open_member() as bus, open_member() as small:
         other, port = bus.open_port(), small.open_port()
         small.bus._multicast._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        other.send_all([(0x181, bytes(8))] * 2000)
+        for each in [(0x181, bytes(8))] * 2000:
+            other.send(*each)
         taken = len(drain(port))
         other.send(0x182, b"")
         taken += len(drain(port))

@@ -2,7 +2,7 @@
 
 import socket
 
-from armlink.loop.channel import Channel
+from armlink.channel import Channel
 
 
 def test_no_state_is_lost_behind_a_reader_that_is_busy():

@@ -1,10 +1,14 @@
-"""Messages between two processes over a socket pair; sending never blocks, receiving takes what is there."""
+"""Processes beside this one, and messages to and from them over a socket pair: sending never blocks, receiving takes
+what is there."""
 
 import pickle
 import select
 import socket
 import struct
+import subprocess
+import sys
 from collections import deque
+from collections.abc import Sequence
 from itertools import islice
 from typing import Any
 
@@ -77,9 +81,17 @@ class Channel:
             self._sent -= len(content)
             self._samples -= sample
 
-    def wait(self, timeout: float) -> None:
-        """Return when something has come, or after `timeout` seconds."""
+    def wait(self, timeout: float | None) -> None:
+        """Return when something has come, or after `timeout` seconds (None: wait without limit)."""
         select.select([self._socket], [], [], timeout)
+
+    def first(self, timeout: float | None = None) -> Any:
+        """The message that the other end begins with; None if none comes within `timeout` seconds. Raises Closed."""
+        while True:
+            self.wait(timeout)
+            messages = self.receive()
+            if messages or timeout is not None:
+                return messages[0] if messages else None
 
     def receive(self) -> list[Any]:
         """All messages that have come, in order; raises Closed when the other end has gone and all were taken."""
@@ -113,3 +125,18 @@ class Channel:
 
     def close(self) -> None:
         self._socket.close()
+
+
+def start_process(program: Sequence[str], inherits: Sequence[int] = ()) -> tuple["subprocess.Popen[bytes]", Channel]:
+    """Python with these arguments in a session of its own, so that nothing of a terminal reaches it, and the channel to
+    it: the number of its end's descriptor is the last argument. It holds the descriptors that it `inherits`."""
+    ours, theirs = socket.socketpair()
+    command, passed = [sys.executable, *program, str(theirs.fileno())], [theirs.fileno(), *inherits]
+    process = subprocess.Popen(command, pass_fds=passed, stdin=subprocess.DEVNULL, start_new_session=True)
+    theirs.close()
+    return process, Channel(ours)
+
+
+def channel_of(descriptor: int) -> Channel:
+    """The channel of a process that `start_process` has started."""
+    return Channel(socket.socket(fileno=descriptor))
