@@ -210,7 +210,7 @@ class Service:
         """An observation against these records, continued from the saved state if that fits; raises Refused."""
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
-        feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer_config())
+        feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer)
         recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
 
         def installed(record: CalibrationRecord, finding: DriftFinding) -> None:
