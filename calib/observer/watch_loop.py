@@ -7,7 +7,7 @@ from armlink.errors import Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
 from calib.observer.decision import Event
-from calib.observer.observer import Observer
+from calib.observer.observer import AnyObserver
 from calib.observer.recalibrator import Recalibration, Recalibrator
 from gcomp.arrays import Array
 
@@ -34,7 +34,7 @@ class WatchHistory:
 
 def watch(
     link: ArmDriver,
-    observer: Observer,
+    observer: AnyObserver,
     targets: Iterable[Array],
     seconds: float,
     recalibrator: Recalibrator | None = None,
@@ -64,7 +64,7 @@ def watch(
     return history
 
 
-def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _recalibrate(event: Event, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
     assert event.finding is not None
     try:
         outcome = recalibrator.handle(event.finding)
@@ -80,7 +80,7 @@ def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, h
         observer.install(event.finding)
 
 
-def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _check(sample: Sample, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
     """After a recalibration: take it back if it made the readings worse."""
     checked = recalibrator.sample(sample.t, sample.position, sample.torque)
     if checked is None or checked.verdict == "kept":
@@ -93,7 +93,7 @@ def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, histo
         observer.install(outcome.undo)
 
 
-def _keep(t: float, observer: Observer, history: WatchHistory) -> None:
+def _keep(t: float, observer: AnyObserver, history: WatchHistory) -> None:
     estimate = observer.estimate()
     history.t.append(t)
     for name in ("gain", "gain_std", "offset", "offset_std"):

@@ -13,7 +13,7 @@ from armlink.link.types import Calibration, Command, DriveSerial, Sample
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.trajectory import WorkMotion, work_targets
 from calib.observer.config import ObserverConfig
-from calib.observer.observer import Observer
+from calib.observer.observer import observer_of
 from calib.observer.recalibrator import Recalibrator
 from calib.observer.watch_loop import WatchHistory, watch
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
@@ -124,7 +124,7 @@ class Setup:
         self.store.put(self.record, arm, by="ann", reason="sweep")
         put_on(self.link, self.record)
         self.arm = arm
-        self.observer = Observer.of_records(self.link.arm, self.record, gravity, RATED, QUICK)
+        self.observer = observer_of(self.link.arm, self.record, gravity, RATED, QUICK)
         self.recalibrator = Recalibrator(arm, self.link, self.store, policy)  # type: ignore[arg-type]
 
     def watch(self, seconds: float) -> WatchHistory:
@@ -206,7 +206,7 @@ def test_on_the_simulated_arm_a_drift_is_found_and_put_right(tmp_path: Path) -> 
         link.enable()
         put_on(link, record)
         described = gcomp_arm(arm)
-        observer = Observer.of_records(described, record, gravity, RATED, QUICK)
+        observer = observer_of(described, record, gravity, RATED, QUICK)
         recalibrator = Recalibrator(arm, link, store, "apply")
         random = np.random.default_rng(seed)
         limits = (described.lower, described.upper, np.ones(3), link.period, random)
