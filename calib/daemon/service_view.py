@@ -11,7 +11,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.arm.kinematics import gcomp_arm, model_arm, model_chain
+from calib.arm.kinematics import frame_origins, gcomp_arm, model_arm, model_chain
 from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
@@ -276,13 +276,10 @@ def drawn_arm(arm_file: ArmFile) -> DrawnArm:
 
 def _of_rows(arm: Arm) -> tuple[Array, list[Array]]:
     """Axes and links of Denavit-Hartenberg rows: a link leads along its joint's axis by d, then along x by a."""
-    rotation = bar_rotations(arm, np.zeros((1, arm.n)))[0]
-    axes, origin, links = rotation[:, :, 2], np.zeros(3), []
-    for turned, axis, along, span in zip(rotation, axes, arm.d, arm.span, strict=True):
-        end = origin + turned @ span
-        links.append(_corners(origin, origin + along * axis, end))
-        origin = end
-    return axes, links
+    zero = np.zeros((1, arm.n))
+    axes, origins = bar_rotations(arm, zero)[0, :, :, 2], frame_origins(arm, zero)[0]
+    feet = origins[:-1] + arm.d[:, None] * axes
+    return axes, [_corners(*each) for each in zip(origins[:-1], feet, origins[1:], strict=True)]
 
 
 def _of_model(placed: PlacedChain) -> tuple[Array, list[Array]]:

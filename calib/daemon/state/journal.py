@@ -23,7 +23,7 @@ from typing import Any, TypeVar, cast
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.environment import RETRY_SECONDS, Immediate, RunAside
-from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of
+from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of, utc_text
 from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
 
@@ -398,7 +398,7 @@ class Journal:
         number, self._next_event = self._next_event, self._next_event + 1
         statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
-            self._write(statement, number, _iso(time), t, kind, joint, text, json.dumps(evidence))
+            self._write(statement, number, utc_text(time), t, kind, joint, text, json.dumps(evidence))
             self.once_kept(lambda: setattr(self, "_last_event", max(self._last_event, number)))
         return number
 
@@ -435,7 +435,7 @@ class Journal:
         """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
         number, self._next_proposal = self._next_proposal, self._next_proposal + 1
         statement = "INSERT INTO proposals(id, time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?, ?)"
-        values = _iso(time), joint, record, base, json.dumps(finding.as_json())
+        values = utc_text(time), joint, record, base, json.dumps(finding.as_json())
         with self.transaction():
             for earlier in self.proposals():
                 if earlier.proposal.joint == joint and earlier.proposal.state == "pending":
@@ -449,7 +449,7 @@ class Journal:
             "INSERT INTO decisions(proposal, time, state, by, note) SELECT ?, ?, ?, ?, ? "
             "WHERE EXISTS (SELECT 1 FROM proposals WHERE id = ?)"
         )
-        self._write(statement, proposal, _iso(time), state, by, note, proposal, proposal=proposal)
+        self._write(statement, proposal, utc_text(time), state, by, note, proposal, proposal=proposal)
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
         return list(self._rows.values())[:limit]
@@ -470,7 +470,7 @@ class Journal:
         self._belief = calibration, gravity, json.dumps(state)
         for waits in list(self._queue)[self._asked :]:  # this one takes their place
             waits.statements = [each for each in waits.statements if each[0] is not _BELIEF]
-        self._write(_BELIEF, _iso(time), *self._belief)
+        self._write(_BELIEF, utc_text(time), *self._belief)
 
     def belief(self) -> SavedBelief | None:
         """The observer's saved state; None if there is none or it cannot be read."""
@@ -482,11 +482,11 @@ class Journal:
 
     def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
         statement = "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)"
-        self._write(statement, _iso(time), t, record, json.dumps(estimate))
+        self._write(statement, utc_text(time), t, record, json.dumps(estimate))
 
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
-        self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", _iso(before), keep_every)
+        self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", utc_text(before), keep_every)
 
 
 def _made(take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]]) -> list[R]:
@@ -511,8 +511,3 @@ def _event(row: tuple[Any, ...]) -> EventRecord:
 def _aged(row: tuple[Any, ...]) -> tuple[float, str | None, dict[str, Any] | None]:
     t, joint, evidence = row
     return float(t), joint, None if evidence is None else dict(json.loads(evidence))
-
-
-def _iso(time: datetime) -> str:
-    """UTC with microseconds: sorts as text."""
-    return time.astimezone(UTC).isoformat(timespec="microseconds")
