@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 from fast_daemon import FastDaemon
+from same_thread import Immediate
 
 from armlink.errors import BusFault
 from armlink.link.types import Calibration
@@ -27,7 +28,6 @@ from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
 from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon import main_loop
-from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import Daemon
 from calib.daemon.settings import DaemonSection, Options
 from calib.daemon.state.events import EventLog

@@ -11,7 +11,6 @@ shows in `trouble`.
 import json
 import logging
 import sqlite3
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,7 +21,7 @@ from typing import Any, TypeVar, cast
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
-from calib.daemon.environment import RETRY_SECONDS, Immediate, RunAside
+from calib.daemon.environment import RETRY_SECONDS, RunAside
 from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of, utc_text
 from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
@@ -94,14 +93,12 @@ class Transaction:
 class Journal:
     """One process writes it; any other may read it. `_db` is for the thread that `run` gives work to."""
 
-    def __init__(
-        self, path: Path, monotonic: Callable[[], float] = time.monotonic, run: RunAside | None = None
-    ) -> None:
+    def __init__(self, path: Path, monotonic: Callable[[], float], run: RunAside) -> None:
         """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s].
 
         One that is damaged is set aside, under another name, and a new one is begun.
         """
-        self.path, self._monotonic, self._run = path, monotonic, run or Immediate()
+        self.path, self._monotonic, self._run = path, monotonic, run
         self._reader = HistoryReader(path)
         self._failed_at, self._asked_at = -float("inf"), float("inf")
         self._took = 0.0

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_bench import run_now
 from fast_daemon import FastDaemon, settings
+from same_thread import Immediate, journal_at
 
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
@@ -21,7 +21,6 @@ from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter, LineLimit
 from calib.daemon.main_loop import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
-from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import HistoryPoint, NoSuch, NotPossible, State
 from calib.observer.config import ObserverConfig
@@ -325,8 +324,8 @@ def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Pat
     daemon.service.tick()
     assert not daemon.of_kind("configuration")
     (write,) = jobs
-    run_now(*write)
-    daemon.run_aside = run_now
+    Immediate()(*write)
+    daemon.run_aside = Immediate()
     daemon.service.tick()
     assert daemon.of_kind("configuration")[0].evidence["joints"] == ["joint_6"]
 
@@ -496,11 +495,11 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
 
 
 def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db")
+    journal = journal_at(tmp_path / "journal.db")
     journal._db.execute("PRAGMA user_version=99")
     journal.close()
     with pytest.raises(BadInput, match="schema 99"):
-        Journal(tmp_path / "journal.db")
+        journal_at(tmp_path / "journal.db")
 
 
 def keep_history(daemon: FastDaemon) -> None:

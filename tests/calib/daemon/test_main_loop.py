@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from same_thread import Immediate
 
 from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm
@@ -18,7 +19,6 @@ from armlink.link.types import Tell
 from armlink.loop.kept_arm import KeptMessage
 from armlink.loop.messages import Told
 from calib.daemon import main_loop
-from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon, Notifier
 from calib.daemon.settings import Options
 from calib.records.file_lock import locked_directory

@@ -89,7 +89,7 @@ def test_a_contact_is_streamed_at_once_and_counted(taught, tmp_path):
     taught.fast.push = lambda q: np.where(np.arange(q.shape[1]) == 1, -PUSH, 0.0) + 0.0 * q
     taught.run(3)
     taught.fast.push = None
-    told = [item.contact for item in client._items if isinstance(item, ContactItem)]
+    told = [item.contact for item in client._queue if isinstance(item, ContactItem)]
     client.close()
     answer = taught.view.external()
     assert told
