@@ -211,7 +211,7 @@ class Service:
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
         feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer)
-        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
+        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, calibration)
 
         def installed(record: CalibrationRecord, finding: DriftFinding) -> None:
             feed.install(record, finding)

@@ -11,7 +11,8 @@ from pydantic import Field, FiniteFloat, field_validator
 from armlink.arm_file import ArmFile, Positive, Section
 from armlink.loop.kept_arm import KeptArm
 from calib.daemon.logs import log_to_stderr
-from calib.observer.config import ObserverConfig, Policy
+from calib.daemon.view import Policy
+from calib.observer.config import ObserverConfig
 
 log = logging.getLogger("armlink.daemon")
 FORMER_THRESHOLDS = frozenset({

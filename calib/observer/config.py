@@ -5,14 +5,11 @@ reason given, and tests/campaigns/daemon_days.py bounds the result: time to find
 payloads recognised, no write in quiet work.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, FiniteFloat
 
 from armlink.arm_file import Section
-
-Policy = Literal["observe", "propose", "apply"]
-"""Treatment of a drift: an event only, a proposal, or a new record written to the controller."""
 
 INITIAL_GAIN_STD = 5e-3
 """Standard deviation of a gain just installed: the accuracy asked of a calibration."""

@@ -42,8 +42,8 @@ def watch(
 ) -> WatchHistory:
     """Run the arm along position targets (n,) [rad], one per cycle, for `seconds` of its clock, and observe.
 
-    Findings go to the recalibrator; the observer takes those that it writes as installed. `on_sample` sees each sample
-    and ends the watch by returning True. Raises BusFault.
+    The recalibrator writes what is found, and the observer takes it as installed; without one nothing is written.
+    `on_sample` sees each sample and ends the watch by returning True. Raises BusFault.
     """
     history, end = WatchHistory(), None
     for target in targets:
@@ -67,17 +67,14 @@ def watch(
 def _recalibrate(event: Event, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
     assert event.finding is not None
     try:
-        outcome = recalibrator.handle(event.finding)
+        outcome = recalibrator.recalibrate(event.finding)
     except Refused as error:
         history.events.append(Event(event.t, "refused", event.joint, {"reason": str(error)}))
         return
-    if outcome is None:
-        return
     history.recalibrations.append((event.t, outcome))
-    evidence = {"record": outcome.record.id, "gain": outcome.gain, "offset": outcome.offset, "applied": outcome.applied}
+    evidence = {"record": outcome.record.id, "gain": outcome.gain, "offset": outcome.offset}
     history.events.append(Event(event.t, "recalibration", event.joint, evidence))
-    if outcome.applied:
-        observer.install(event.finding)
+    observer.install(event.finding)
 
 
 def _check(sample: Sample, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:

@@ -270,20 +270,20 @@ class Demo:
                 began = sample.t
                 bench.simulated.drift(joint, DRIFT_GAIN, offset)
                 before = bench.sensor_error(joint)
-            written = [t for t, outcome in history.recalibrations if outcome.applied]
+            written = [t for t, _ in history.recalibrations]
             state = "recalibrated" if written else "the arm works" if began == np.inf else "the sensor has drifted"
             end = min(written[-1] - start + WATCHED_SECONDS if written else np.inf, WORK_SECONDS)
             screen.count(int(sample.t - start), int(end), f"s of work, {state}")
             return bool(written) and sample.t - written[-1] >= WATCHED_SECONDS
 
         observer = observer_of(described, record, model, section.rated_torques)
-        recalibrator = Recalibrator(bench.arm, link, self.store, "apply")
+        recalibrator = Recalibrator(bench.arm, link, self.store)
         with account.stage("ordinary work, during which a torque sensor will drift") as screen:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
         # of any joint: which one drifted is found later
         times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, after=began)) is not None]
         noticed = min(times, default=None)
-        made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name and done.applied]
+        made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name]
         written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written
         seen = "not noticed" if noticed is None else f"noticed after {noticed:.1f} s"

@@ -290,7 +290,7 @@ def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None
     proposal = daemon.view.proposals()[0]
     daemon.service.journal.decide(daemon.service.journal.proposals()[0].id, daemon.wall(), "approved", "ann")
     daemon.service.save()
-    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store, "propose")
+    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store)
     recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
     rows = daemon.view.status().rows
     daemon.kill()
