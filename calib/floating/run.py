@@ -96,10 +96,6 @@ class FloatControl:
         """The model's torque alone (n,) [N·m] at position readings (n,) [rad]."""
         return np.asarray(self._model.one(self._gain * position + self._offset))
 
-    @property
-    def speed(self) -> Array:
-        return self._speed
-
     def _damping(self) -> Array:
         config, relative = self.config, self._speed / self._top
         beyond = np.maximum(np.abs(relative) - config.fast_share, 0.0) / (1.0 - config.fast_share)

@@ -20,6 +20,7 @@ from armlink.loop.messages import Down, Up
 from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter, LineLimit
 from calib.daemon.main_loop import Notifier, watchdog_seconds
+from calib.daemon.rate_limit import Rate
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import HistoryPoint, NoSuch, NotPossible, State
@@ -588,7 +589,7 @@ def test_a_log_line_is_one_json_object() -> None:
 
 
 def test_a_flood_of_log_lines_is_cut_and_counted() -> None:
-    limit, lines = LineLimit(burst=3, per_second=1), []
+    limit, lines = LineLimit(Rate(burst=3, per_second=1)), []
     for second in (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0):
         record = logging.makeLogRecord({"name": "uvicorn", "levelname": "WARNING", "msg": "again", "created": second})
         if limit.filter(record):
