@@ -145,7 +145,7 @@ class MotorBelief:
 
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array) -> None:
         """Of records of creep sweeps; rated torques (n,) [N·m]."""
-        self.arm, self.rated, n = arm, rated, arm.n
+        self.arm, n = arm, arm.n
         doubt = MotorDoubt()  # of what the records do not hold
         motors = [_motor(joint.motor) for joint in calibration.joints]
         self._at = family_slices(n)

@@ -26,10 +26,9 @@ class WatchHistory:
     events: list[Event] = field(default_factory=list)
     recalibrations: list[tuple[float, Recalibration]] = field(default_factory=list)
 
-    def first(self, kind: str, joint: str | None = None, after: float = 0.0) -> float | None:
-        """Time of the first event of a kind, on a joint or on any, from `after` on; None if there was none."""
-        of_kind = (event for event in self.events if event.kind == kind and event.t >= after)
-        return next((event.t for event in of_kind if joint in (None, event.joint)), None)
+    def first(self, kind: str, after: float = 0.0) -> float | None:
+        """Time of the first event of a kind from `after` on; None if there was none."""
+        return next((event.t for event in self.events if event.kind == kind and event.t >= after), None)
 
 
 def watch(

@@ -216,8 +216,7 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
-        notifier = main_loop.Notifier
-        patch.setattr(main_loop, "Notifier", lambda: notifier("systemd"))
+        patch.setenv("NOTIFY_SOCKET", "systemd")
         kinds = {name: getattr(socket, name) for name in ("AF_UNIX", "SOCK_DGRAM", "SOCK_NONBLOCK")}
         patch.setattr(
             main_loop, "socket", SimpleNamespace(socket=lambda *_: NotifySocket(self.failing, self.heard), **kinds)

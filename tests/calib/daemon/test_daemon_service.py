@@ -570,9 +570,10 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(path))
-        Notifier(str(path))("READY=1", "STATUS=observing")
+        monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+        Notifier()("READY=1", "STATUS=observing")
         assert receiver.recv(100) == b"READY=1\nSTATUS=observing"
-    Notifier(str(path))("WATCHDOG=1")  # gone: no reason to stop
+    Notifier()("WATCHDOG=1")  # gone: no reason to stop
     monkeypatch.setenv("WATCHDOG_USEC", "30000000")
     monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
     assert watchdog_seconds() == 30.0

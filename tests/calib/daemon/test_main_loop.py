@@ -185,9 +185,12 @@ def test_systemd_is_told_of_the_end_of_a_reload_whatever_happens(
         assert receiver.recv(200) == b"READY=1"
 
 
-def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(tmp_path: Path) -> None:
+def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "notify"
-    notify = Notifier(str(path))
+    monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+    notify = Notifier()
     for line in (
         "READY=1",
         "STATUS=starting",

@@ -42,7 +42,7 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> FastDaemon:
     )
     work = Recording(t=t, names=daemon.arm.joint_names, position=q, torque=torque)
     records = records_of(daemon)
-    listener = listener_of(records, [work], [], "torque")
+    listener = listener_of(records, [work], [])
     frame = WrenchFrame(daemon.fast.n - 1, np.array([0.0, 0.0, 0.1]))
     save_learned(daemon.service.external.path, Learned(listener, frame, 1.0))
     return daemon
