@@ -97,9 +97,10 @@ class Configuration:
 @dataclass(frozen=True)
 class Options:
     arm: str
+    socket: Path
+    """Of API and page."""
     bus: str | None = None
     listen_only: bool = False
-    socket: Path | None = None
     tcp: tuple[str, int] | None = None
     token: str | None = None
     policy: Policy | None = None

@@ -196,7 +196,9 @@ class FailingDaemon(FastDaemon):
 
     def start(self, up: bool = True) -> None:
         self._surround()
-        options = Options(arm="sarcos", policy="apply", store=str(self.directory / "records.db"))
+        options = Options(
+            "sarcos", self.directory / "api.sock", policy="apply", store=str(self.directory / "records.db")
+        )
         settings = self.settings
         self._patch.setattr(Options, "settings", lambda *_: settings)
         self.daemon = Daemon(options, self.arm, BusProcess(self), self.directory / "state")

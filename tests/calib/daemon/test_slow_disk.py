@@ -56,7 +56,7 @@ def waiting(daemon: FastDaemon) -> int:
 
 def test_the_event_loop_turns_and_answers_while_the_disk_does_not(tmp_path: Path) -> None:
     async def main() -> None:
-        options = Options(arm="sarcos", store=str(tmp_path / "records.db"))
+        options = Options(arm="sarcos", socket=tmp_path / "api.sock", store=str(tmp_path / "records.db"))
         daemon = Daemon(options, load_arm("sarcos"), NoProcess(), tmp_path / "state")  # type: ignore[arg-type]
         journal = daemon.service.journal
         slow: Any = SlowCommit(journal._db)

@@ -71,9 +71,9 @@ def test_a_socket_left_by_a_killed_daemon_is_replaced_and_a_live_one_is_not(tmp_
 
 
 @pytest.mark.parametrize("token", [None, "", "short"])
-def test_tcp_without_a_proper_token_is_refused_at_the_start(token: str | None) -> None:
+def test_tcp_without_a_proper_token_is_refused_at_the_start(token: str | None, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="token of at least 16"):
-        asyncio.run(serve(MadeUpView(), socket=None, tcp=("127.0.0.1", 1), token=token))
+        asyncio.run(serve(MadeUpView(), socket=tmp_path / "api.sock", tcp=("127.0.0.1", 1), token=token))
 
 
 @pytest.mark.parametrize(
