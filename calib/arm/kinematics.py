@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from calib.arm.tool import tool_moments
-from gcomp.arm.arm import Arm
+from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.load import ModelArm, PlacedChain, place_chain
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
@@ -36,6 +36,15 @@ def gcomp_arm(arm_file: ArmFile) -> Arm:
         )
     except GcompError as error:
         raise BadInput(f"{arm_file.path}: kinematics: {error}") from None
+
+
+def frame_origins(arm: Arm, q: Array) -> Array:
+    """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
+    rotation = bar_rotations(arm, q)
+    along = np.einsum("knij,nj->kni", rotation, arm.span)
+    places = np.zeros((len(q), arm.n + 1, 3))
+    places[:, 1:] = np.cumsum(along, axis=1)
+    return places
 
 
 def model_arm(arm_file: ArmFile, placed: PlacedChain | None = None) -> ModelArm:

@@ -85,9 +85,9 @@ def daemon(
     address = None if tcp is None else _address(tcp, token)
     options = Options(
         arm=arm,
+        socket=socket or directory / "api.sock",
         bus=bus,
         listen_only=listen_only,
-        socket=socket or directory / "api.sock",
         tcp=address,
         token=token,
         policy=policy,

@@ -156,7 +156,7 @@ def external(
         draw_map(picture, places, force, f"{arm}: smallest force at {names[place.link]} found in 95 %, at rest")
         console.print(f"{picture}: half of the workspace needs {np.median(force):.1f} N or less")
     if out is not None:
-        save_heard(out, every, names, "base")
+        save_heard(out, every, names)
         console.print(f"{out} is written")
     write_json(
         json_file,

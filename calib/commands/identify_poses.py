@@ -47,7 +47,6 @@ class PoseOptions:
 class Judged:
     """A fit, beside the model's own mass moments with all else fitted: RMS of held-out readings (n,) [N·m]."""
 
-    model: StatedModel
     fit: PoseFit
     held_out: Array
     nominal: Array
@@ -77,11 +76,11 @@ def judged_fit(
     fit = fit_poses(model.arm, readings, rated, nominal, gain_std, sources)
     plain = fit.with_nominal_moments()
     if not heldout:
-        return Judged(model, fit, fit.held_out(), plain.held_out())
+        return Judged(fit, fit.held_out(), plain.held_out())
     held, other, _ = load_poses(heldout, model, masses, stated)
     if other != channel:
         raise BadInput(f"--heldout {heldout[0]}: its torque channel differs from that of the poses")
-    return Judged(model, fit, rms(fit.errors(held)), rms(plain.errors(held)))
+    return Judged(fit, rms(fit.errors(held)), rms(plain.errors(held)))
 
 
 def reference_masses(given: Sequence[str], poses: Sequence[Path]) -> dict[str, float]:

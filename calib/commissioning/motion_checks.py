@@ -7,14 +7,14 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.drives.findings import SetupFinding
-from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
+from calib.arm.kinematics import DriveLimits, model_arm, model_chain
 from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.commissioning.model_checks import gravity_need
 from calib.plan.collisions import check_plan
 from calib.plan.creep_plan import plan_creep
+from calib.plan.planned_arm import PlannedArm
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
-from calib.plan.sweep_options import pressable_joints, sweep_range
 from calib.plan.sweep_plan import plan_sweep
 from gcomp.arm.load import ModelArm, joint_inertias
 
@@ -110,11 +110,11 @@ def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
 
 def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints that cannot be pressed on any stop within max_torque while another is swept."""
-    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
-    ever = np.zeros(arm.n, dtype=bool)
+    planned = PlannedArm(arm_file, guess)
+    arm, ever = planned.arm, np.zeros(planned.arm.n, dtype=bool)
     for joint in range(arm.n):
-        candidates = stop_combinations(arm, joint, sweep_range(section, limits, joint))
-        ever |= pressable_joints(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
+        candidates = stop_combinations(arm, joint, planned.sweep_range(joint))
+        ever |= planned.pressable_joints(candidates).any(axis=0) & (np.arange(arm.n) != joint)
     for name, pressed in zip(arm.names, ever, strict=True):
         if pressed or arm.n == 1:
             continue

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar
@@ -38,20 +38,6 @@ class Disk(RunAside, Protocol):
         ...
 
 
-class Immediate:
-    """`Disk` for one thread alone: work is done, and its outcome given, before the call returns."""
-
-    def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        try:
-            outcome: T | Exception = work()
-        except Exception as error:
-            outcome = error
-        done(outcome)
-
-    def drain(self, seconds: float, /) -> bool:
-        return True
-
-
 class BusAccess(Protocol):
     @property
     def controllers(self) -> Controllers:
@@ -74,7 +60,7 @@ class Environment:
     run: RunAside
     """For bus and record store."""
     port: BusAccess
-    disk: Disk = field(default_factory=Immediate)
+    disk: Disk
 
 
 class BusJobs:

@@ -5,14 +5,18 @@ import logging
 import queue
 import sys
 import threading
+from collections import Counter
 from datetime import UTC, datetime
 from typing import TextIO
 
 from armlink.content.printable_text import printable_json, printable_text
 from calib.daemon.environment import CLOSING_SECONDS
+from calib.daemon.rate_limit import Rate, RateLimit
 
 MOST_LINES = 10_000
 """Lines that wait for a reader of stderr that takes none; further ones are dropped."""
+LINES = Rate(burst=200, per_second=20)
+"""Of one logger."""
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -80,21 +84,17 @@ class LineQueue:
 
 
 class LineLimit(logging.Filter):
-    """Lets a logger have so many lines at once and so many a second; the next line says how many were left out."""
+    """Limits the lines of each logger; the next line says how many were left out."""
 
-    def __init__(self, burst: float = 200.0, per_second: float = 20.0) -> None:
+    def __init__(self, rate: Rate = LINES) -> None:
         super().__init__()
-        self._burst, self._per_second = burst, per_second
-        self._buckets: dict[str, tuple[float, float, int]] = {}
+        self._limit, self._missing = RateLimit(rate), Counter[str]()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        left, since, missing = self._buckets.get(record.name, (self._burst, record.created, 0))
-        left = min(self._burst, left + max(record.created - since, 0.0) * self._per_second)
-        if left < 1.0:
-            self._buckets[record.name] = left, record.created, missing + 1
+        if self._limit.take(record.name, record.created):
+            self._missing[record.name] += 1
             return False
-        self._buckets[record.name] = left - 1.0, record.created, 0
-        if missing:
+        if missing := self._missing.pop(record.name, 0):
             record.left_out = missing
         return True
 

@@ -34,11 +34,10 @@ from calib.records.store import RecordStore
 
 
 class Notifier:
-    """Sends to the socket of NOTIFY_SOCKET; does nothing if there is none."""
+    """Sends to the socket of NOTIFY_SOCKET, where a leading @ means an abstract one; does nothing if there is none."""
 
-    def __init__(self, address: str | None = None) -> None:
-        """`address` defaults to the environment's; a leading @ means an abstract socket."""
-        given = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
+    def __init__(self) -> None:
+        given = os.environ.get("NOTIFY_SOCKET", "")
         self._address = "\0" + given[1:] if given.startswith("@") else given
         self._waiting: dict[str, str] = {}
         """Messages that the socket has not taken, in order, by the name of their first assignment."""

@@ -210,8 +210,8 @@ class Service:
         """An observation against these records, continued from the saved state if that fits; raises Refused."""
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
-        feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer_config())
-        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
+        feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer)
+        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, calibration)
 
         def installed(record: CalibrationRecord, finding: DriftFinding) -> None:
             feed.install(record, finding)

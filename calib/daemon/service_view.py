@@ -11,7 +11,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.arm.kinematics import gcomp_arm, model_arm, model_chain
+from calib.arm.kinematics import frame_origins, gcomp_arm, model_arm, model_chain
 from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
@@ -21,7 +21,7 @@ from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.live import LiveExternal
 from calib.external.tables import wrench_of
-from gcomp.arm.arm import Arm
+from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
 from gcomp.external.external_model import NORMAL_95
@@ -206,7 +206,7 @@ class ServiceView:
 
     def subscribe(self) -> Client:
         client = self._service.hub.subscribe()
-        client.put(self.snapshot())
+        client.add(self.snapshot())
         return client
 
     def snapshot(self) -> view.JointsItem:
@@ -276,16 +276,10 @@ def drawn_arm(arm_file: ArmFile) -> DrawnArm:
 
 def _of_rows(arm: Arm) -> tuple[Array, list[Array]]:
     """Axes and links of Denavit-Hartenberg rows: a link leads along its joint's axis by d, then along x by a."""
-    rotation, origin = np.eye(3), np.zeros(3)
-    axes, links = np.empty((arm.n, 3)), []
-    for i in range(arm.n):
-        axes[i] = rotation[:, 2]
-        rotation = rotation @ _turn(arm.theta_offset[i], 2)
-        foot = origin + arm.d[i] * rotation[:, 2]
-        end = foot + arm.a[i] * rotation[:, 0]
-        links.append(_corners(origin, foot, end))
-        rotation, origin = rotation @ _turn(arm.alpha[i], 0), end
-    return axes, links
+    zero = np.zeros((1, arm.n))
+    axes, origins = bar_rotations(arm, zero)[0, :, :, 2], frame_origins(arm, zero)[0]
+    feet = origins[:-1] + arm.d[:, None] * axes
+    return axes, [_corners(*each) for each in zip(origins[:-1], feet, origins[1:], strict=True)]
 
 
 def _of_model(placed: PlacedChain) -> tuple[Array, list[Array]]:
@@ -303,11 +297,3 @@ def _corners(*points: Array) -> Array:
         if np.linalg.norm(point - kept[-1]) > 1e-6:
             kept.append(point)
     return np.array(kept)
-
-
-def _turn(angle: float, axis: int) -> Array:
-    """Rotation matrix about the x (0) or z (2) axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    if axis == 0:
-        return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,8 @@ from pydantic import Field, FiniteFloat, field_validator
 from armlink.arm_file import ArmFile, Positive, Section
 from armlink.loop.kept_arm import KeptArm
 from calib.daemon.logs import log_to_stderr
-from calib.observer.config import ObserverConfig, Policy
+from calib.daemon.view import Policy
+from calib.observer.config import ObserverConfig
 
 log = logging.getLogger("armlink.daemon")
 FORMER_THRESHOLDS = frozenset({
@@ -21,7 +22,6 @@ FORMER_THRESHOLDS = frozenset({
     "patience", "place_memory", "place_rows", "place_size", "places", "significance",
 })  # fmt: skip
 """Keys that arm files of earlier versions may have: constants by now."""
-_WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)
 
 
 class RecordingSettings(Section):
@@ -65,30 +65,16 @@ class DaemonSection(Section):
     """Whether the daemon, if it drives the bus, moves the arm among random poses, in place of ordinary work."""
     recording: RecordingSettings = RecordingSettings()
     diagnosis: DiagnosisSettings = DiagnosisSettings()
-    observer: dict[str, FiniteFloat] = Field(default_factory=dict)
-    """Settings of the observer (calib/observer/config.py) that differ from their defaults."""
+    observer: ObserverConfig = ObserverConfig()
 
-    @field_validator("observer")
+    @field_validator("observer", mode="before")
     @classmethod
-    def _known(cls, given: dict[str, float]) -> dict[str, float]:
-        known = [field.name for field in fields(ObserverConfig)]
-        for name in sorted(given):
-            if name in FORMER_THRESHOLDS:
-                log.warning("daemon.observer.%s is no setting any more: left out", name)
-                del given[name]
-            elif name not in known:
-                raise ValueError(f"there is no threshold {name!r}; there are {', '.join(known)}")
-        for name, value in given.items():
-            if value < (1 if name in _WHOLE else 0):
-                least = "a whole number of at least 1" if name in _WHOLE else "a number of at least 0"
-                raise ValueError(f"threshold {name} is {value:g}, expected {least}")
-        return given
-
-    def observer_config(self) -> ObserverConfig:
-        """The observer's thresholds; integers stay integers."""
-        return ObserverConfig(
-            **{name: int(value) if name in _WHOLE else value for name, value in self.observer.items()}  # type: ignore[arg-type]
-        )
+    def _without_former(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        for name in sorted(FORMER_THRESHOLDS & given.keys()):
+            log.warning("daemon.observer.%s is no setting any more: left out", name)
+        return {name: value for name, value in given.items() if name not in FORMER_THRESHOLDS}
 
 
 def daemon_section(arm: ArmFile) -> DaemonSection:
@@ -111,9 +97,10 @@ class Configuration:
 @dataclass(frozen=True)
 class Options:
     arm: str
+    socket: Path
+    """Of API and page."""
     bus: str | None = None
     listen_only: bool = False
-    socket: Path | None = None
     tcp: tuple[str, int] | None = None
     token: str | None = None
     policy: Policy | None = None

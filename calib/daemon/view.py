@@ -28,6 +28,8 @@ class State(StrEnum):
     FAULT = "fault"
 
 
+Policy = Literal["observe", "propose", "apply"]
+"""Treatment of a drift: an event only, a proposal, or a new record written to the controller."""
 ProposalState = Literal["pending", "approved", "applied", "rejected", "failed", "superseded"]
 
 
@@ -77,7 +79,7 @@ class Status(Answer):
     arm: str
     serial: str
     version: str
-    policy: Literal["observe", "propose", "apply"]
+    policy: Policy
     listen_only: bool
     time: AwareDatetime
     t: float

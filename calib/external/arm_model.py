@@ -86,13 +86,11 @@ def channel_of(recordings: Sequence[Recording]) -> str:
     raise BadInput("the recordings have no torque channel in common: tau_1 …, tau_motor_1 … or tau_cmd_1 …")
 
 
-def listener_of(
-    records: ArmRecords, baselines: Sequence[Recording], recordings: Sequence[Recording], channel: str | None = None
-) -> ArmListener:
+def listener_of(records: ArmRecords, baselines: Sequence[Recording], recordings: Sequence[Recording]) -> ArmListener:
     """Learned from `baselines`; without any, by the records alone. Recordings have the arm's joints in its order."""
     arm = records.stated.arm
     every = [*baselines, *recordings]
-    channel = channel or (channel_of(every) if every else records.usual_channel)
+    channel = channel_of(every) if every else records.usual_channel
     rate = rate_of(every) if every else ROWS_RATE
     warm = _usual_temperature(baselines or recordings)
 

@@ -98,10 +98,8 @@ def require_writable(path: Path) -> None:
         require_extra("--out", "parquet")
 
 
-def save_heard(
-    path: Path, judged: Sequence[tuple[str, Array, Sequence[Heard]]], names: tuple[str, ...], frame_id: str
-) -> None:
-    """Write by suffix; of each recording label, times and stretches; `frame_id` names the axes of a wrench."""
+def save_heard(path: Path, judged: Sequence[tuple[str, Array, Sequence[Heard]]], names: tuple[str, ...]) -> None:
+    """Write by suffix; of each recording label, times and stretches."""
     heard = [each for *_, stretches in judged for each in stretches]
     if path.suffix == ".parquet":
         _save_observations(path, judged)
@@ -116,7 +114,7 @@ def save_heard(
 
     columns = ((each.t, each.judged.external, each.judged.std, each.wrench.value) for each in heard)
     t, external, std, value = (np.concatenate(column) for column in zip(*columns, strict=True))
-    save_wrench_bag(path, t, names, external, std, frame_id, value)
+    save_wrench_bag(path, t, names, external, std, "base", value)
 
 
 def _save_observations(path: Path, judged: Sequence[tuple[str, Array, Sequence[Heard]]]) -> None:

@@ -57,8 +57,6 @@ class CreepFit(FittedCalibration):
     rows: SweepReadings
     solution: PosteriorFit
     prior_std: Array
-    scatter: Scatter
-    """Of the readings."""
     ripple: Array
     """Periods in a turn of the ripple that each joint has, 0 for none (n,)."""
     pushes: tuple[FitFinding, ...] = ()
@@ -225,7 +223,7 @@ def _fit(
         scattered = scatter(rows, found.residual, rated, freedom, by_degree, ripple)
         if ripple and not model.ripple.any():
             model = MotorModel(arm, rows.readings, ripple_cycles(rows, found.residual))
-    return CreepFit(arm, rows, found, std, scattered, model.ripple)
+    return CreepFit(arm, rows, found, std, model.ripple)
 
 
 def _unevenness(found: PosteriorFit, std: Array, coulomb: Array, doubt: MotorDoubt) -> Array:

@@ -41,16 +41,14 @@ LEAST_STD_SHARE = 1e-4
 class Scatter:
     """Covariance of the rows, sweep by sweep."""
 
-    sigma: Array
-    """Standard deviation of each row (R,) [N·m]."""
     blocks: tuple[tuple[NDArray[Any], Array], ...]
     """Rows (K,) of each sweep, and the inverse of the triangular root of their covariance (K, K)."""
 
     @classmethod
     def even(cls, rows: SweepReadings, sigma: Array) -> "Scatter":
-        """Rows that have nothing in common."""
+        """Rows that have nothing in common, of standard deviations sigma (R,) [N·m]."""
         blocks = [np.flatnonzero(rows.readings.series == sweep) for sweep in np.unique(rows.readings.series)]
-        return cls(sigma, tuple((each, np.asarray(np.diag(1 / sigma[each]))) for each in blocks))
+        return cls(tuple((each, np.asarray(np.diag(1 / sigma[each]))) for each in blocks))
 
     def whitened(self, columns: Array) -> Array:
         """Columns (R, …) of which the rows have unit variance and nothing in common."""
@@ -70,7 +68,7 @@ def scatter(
     [N·m] is what the temperature's uncertainty makes of each reading, alike in all rows of a sweep. Without
     `apart` both directions have one variance, and nothing in common: a contact would pass for scatter of the half sums.
     """
-    sigma, blocks = np.zeros(len(rows)), []
+    blocks = []
     residual = residual / np.sqrt(max(freedom, 0.2))
     for joint in range(len(rated)):
         pairs = [_row_pairs(rows, joint, sweep) for sweep in np.unique(rows.readings.series[rows.swept == joint])]
@@ -85,9 +83,8 @@ def scatter(
             for k in range(up.size):
                 covariance[k, up.size + k] = covariance[up.size + k, k] = a - b
             covariance += np.outer(by_degree[each], by_degree[each])
-            sigma[each] = np.sqrt(np.diag(covariance))
             blocks.append((each, np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), float)))
-    return Scatter(sigma, tuple(blocks))
+    return Scatter(tuple(blocks))
 
 
 def _row_pairs(

@@ -10,6 +10,7 @@ from armlink.errors import Refused
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.dataset import SweepData, digests
+from calib.fit.calibration import rms
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
@@ -83,7 +84,7 @@ def identify_gravity(
         covariance=covariance,
         identifiable=found,
         recursive=_recursion(arm_file, rows, calibration),
-        residual_rms=_rms(residual),
+        residual_rms=np.nan_to_num(rms(residual)),
         sources=digests(data),
     )
 
@@ -140,10 +141,3 @@ def _require_scale(names: tuple[str, ...], lost: Mask) -> None:
             "factor: sweep with --reference-mass on an arm whose axes do not all meet, or give a calibration "
             "record"
         )
-
-
-def _rms(values: Array) -> Array:
-    counted = np.isfinite(values)
-    total = np.where(counted, values**2, 0.0).sum(axis=0)
-    rms: Array = np.sqrt(total / np.maximum(counted.sum(axis=0), 1))
-    return rms

@@ -43,8 +43,6 @@ class RandomEffects:
     square: Array
     """(m, m)."""
     right: Array
-    rest: float
-    """Sum of squares that parameters and nuisances leave."""
     family: npt.NDArray[np.int64]
     """Family of each effect (m,)."""
     families: int
@@ -62,11 +60,9 @@ class RandomEffects:
         factor = linalg.cho_factor(square, lower=True, check_finite=False)
         across, along = fixed.T @ padded, fixed.T @ target
         taken = linalg.cho_solve(factor, np.column_stack([across, along]), check_finite=False)
-        rest = float(target @ target - along @ taken[:, -1])
         return cls(
             effects.T @ effects - across.T @ taken[:, :-1],
             effects.T @ target[: len(effects)] - across.T @ taken[:, -1],
-            rest,
             family,
             families,
         )

@@ -9,6 +9,7 @@ from armlink.recording.recording import Recording
 from armlink.torque_calibration import TorqueCalibration
 from calib.dataset import SweepData
 from calib.fit.sweep_readings import sweep_readings
+from calib.motion.static_reading import slope
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 
@@ -51,7 +52,7 @@ def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowA
     windows = _windows(t)
     if not windows:
         raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
-    slopes = np.array([_slope(t[each], position[each]) for each in windows])
+    slopes = np.array([slope(t[each], position[each]) for each in windows])
     middles = np.array([t[each].mean() for each in windows])
     change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
     padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, position.shape[1]))
@@ -121,16 +122,9 @@ def _windows(t: Array) -> list[slice]:
     return windows
 
 
-def _slope(t: Array, values: Array) -> Array:
-    """Mean rate of change (n,) by least squares."""
-    time = t - t.mean()
-    slope: Array = time @ (values - values.mean(axis=0)) / (time @ time)
-    return slope
-
-
 def _scatter(t: Array, values: Array) -> Array:
     """Standard deviation (n,) about a straight line."""
-    line = np.outer(t - t.mean(), _slope(t, values)) + values.mean(axis=0)
+    line = np.outer(t - t.mean(), slope(t, values)) + values.mean(axis=0)
     scatter: Array = np.sqrt(((values - line) ** 2).sum(axis=0) / max(len(t) - 2, 1))
     return scatter
 

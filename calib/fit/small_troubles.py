@@ -166,8 +166,6 @@ class Troubles:
     """Change of each reading per coefficient, in units of the family (P, m) [N·m]."""
     family: npt.NDArray[np.int64]
     """Index in FAMILIES of each coefficient (m,)."""
-    joint: npt.NDArray[np.int64]
-    """Joint that each coefficient belongs to (m,)."""
     kept: Mask
     """Which of all columns these are: those that change some reading."""
 
@@ -191,26 +189,24 @@ def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep
     `keep` chooses columns; default: those that change some reading.
     """
     counted = rows.readings.counted
-    dense = _dense(setting, rows, parameters)
-    found = [(family, joint, values[counted] * UNITS[family][0]) for family, joint, values in dense]
+    found = [(family, change[counted] * UNITS[family][0]) for family, change in _dense(setting, rows, parameters)]
     for joint, field in enumerate(setting.fields):
         here = counted[:, joint]
         values = np.zeros((*counted.shape, field.root.shape[0]))
         values[here, joint] = setting.rated[joint] * field.columns(rows.readings.position[here])
-        found += [("field", joint, column) for column in values[counted].T * UNITS["field"][0]]
+        found += [("field", column) for column in values[counted].T * UNITS["field"][0]]
     if keep is None:
-        keep = np.array([np.abs(each[2]).max(initial=0.0) > 0 for each in found])
+        keep = np.array([np.abs(column).max(initial=0.0) > 0 for _, column in found])
     kept = [each for each, wanted in zip(found, keep, strict=True) if wanted]
     return Troubles(
-        np.column_stack([np.zeros((int(counted.sum()), 0)), *(each[2] for each in kept)]),
-        np.array([FAMILIES.index(each[0]) for each in kept], dtype=np.int64),
-        np.array([each[1] for each in kept], dtype=np.int64),
+        np.column_stack([np.zeros((int(counted.sum()), 0)), *(column for _, column in kept)]),
+        np.array([FAMILIES.index(family) for family, _ in kept], dtype=np.int64),
         keep,
     )
 
 
-def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, int, Array]]:
-    """(Family, joint, change of all readings (K, n) per unit) of every named trouble."""
+def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, Array]]:
+    """(Family, change of all readings (K, n) per unit) of every named trouble."""
     arm, readings, rated = setting.arm, rows.readings, setting.rated
     n, gain = arm.n, parameters.gain
     frames = bar_frames(arm, joint_positions(parameters, readings))
@@ -240,53 +236,53 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
     for joint in range(n):
         base = BASE if joint == 0 else 1.0
         for axis in _crossing(arm, frames.rotation, joint):
-            yield "axes", joint, gain * turn(joint, axis) * base
+            yield "axes", gain * turn(joint, axis) * base
             for link, across in product(range(joint, upright), range(2)):
                 moment = unseen * frames.rotation[:, link, :, across]
                 change = gain * swung(joint, axis, moment, link) * base
-                yield "upright", joint, change
+                yield "upright", change
         stiffness = gain * turn(joint, frames.rotation[:, joint, :, 2])
         angle = readings.position[:, joint]
-        yield "eccentricity", joint, stiffness * np.sin(angle)[:, None]
-        yield "eccentricity", joint, stiffness * np.cos(angle)[:, None]
-        yield "sag", joint, stiffness * felt[:, joint, None] / rated[joint]
+        yield "eccentricity", stiffness * np.sin(angle)[:, None]
+        yield "eccentricity", stiffness * np.cos(angle)[:, None]
+        yield "sag", stiffness * felt[:, joint, None] / rated[joint]
         if joint < n - 1:
             for across in range(3):  # a length: where the load hangs beyond this link
                 shift = np.einsum("kid,kd->ki", frames.lever, frames.rotation[:, joint, :, across])
                 reach = np.where(np.arange(n) <= joint, shift, 0.0) * readings.load[:, None]
-                yield "axes", joint, gain * reach
+                yield "axes", gain * reach
     own, bare = np.eye(n), np.ones((len(torque), 1))
     middle = (arm.lower + arm.upper) / 2
     since = _waves(rows.time, setting.span)
     for joint, here in enumerate(own):
         for other in {joint - 1, joint + 1} & set(range(n)):
-            yield "crosstalk", joint, here * gain[joint] * felt[:, other, None]
+            yield "crosstalk", here * gain[joint] * felt[:, other, None]
         share = torque[:, joint, None] / rated[joint]
-        yield "nonlinear", joint, here * gain[joint] * rated[joint] * share**3
+        yield "nonlinear", here * gain[joint] * rated[joint] * share**3
         for other in {joint - 1, joint, joint + 1} & set(range(n)):
             bent = readings.position[:, other, None] - middle[other]
-            yield "spring", joint, here * gain[joint] * rated[joint] * bent
-        yield "spring", joint, here * gain[joint] * rated[joint] * REST * bare
+            yield "spring", here * gain[joint] * rated[joint] * bent
+        yield "spring", here * gain[joint] * rated[joint] * REST * bare
         side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
-        yield "direction", joint, here * rated[joint] * side
-        yield "direction", joint, here * rated[joint] * setting.lags.sensor[:, joint, None]
+        yield "direction", here * rated[joint] * side
+        yield "direction", here * rated[joint] * setting.lags.sensor[:, joint, None]
         for lag in setting.lags.cable:
-            yield "direction", joint, here * rated[joint] * lag[:, joint, None]
+            yield "direction", here * rated[joint] * lag[:, joint, None]
             for other in {joint - 1, joint + 1} & set(range(n)):
                 beside = BESIDE * lag[:, other, None]
-                yield "direction", joint, here * rated[joint] * beside
+                yield "direction", here * rated[joint] * beside
         share = (readings.position[:, joint] - middle[joint])[:, None] / ((arm.upper - arm.lower)[joint] / 2)
         for bend in (share, 1.5 * share**2 - 0.5, 2.5 * share**3 - 1.5 * share):
-            yield "direction", joint, here * rated[joint] * side * bend
+            yield "direction", here * rated[joint] * side * bend
         for number in range(len(rows.sweeps)):
             during = (readings.series == number) & (rows.swept >= 0)
             moved = (during & (rows.swept == joint))[:, None]
             scale = here * rated[joint]
-            yield "direction", joint, scale * ROUGHLY * (during[:, None] & ~moved)
-            yield "direction", joint, scale * ROUGHLY * moved
-            yield "direction", joint, scale * ROUGHLY * side * moved
+            yield "direction", scale * ROUGHLY * (during[:, None] & ~moved)
+            yield "direction", scale * ROUGHLY * moved
+            yield "direction", scale * ROUGHLY * side * moved
         for wave in since:
-            yield "drift", joint, here * gain[joint] * rated[joint] * wave[:, None]
+            yield "drift", here * gain[joint] * rated[joint] * wave[:, None]
 
 
 def _along_axes(arm: Arm, rho: Array) -> Array:

@@ -96,10 +96,6 @@ class FloatControl:
         """The model's torque alone (n,) [N·m] at position readings (n,) [rad]."""
         return np.asarray(self._model.one(self._gain * position + self._offset))
 
-    @property
-    def speed(self) -> Array:
-        return self._speed
-
     def _damping(self) -> Array:
         config, relative = self.config, self._speed / self._top
         beyond = np.maximum(np.abs(relative) - config.fast_share, 0.0) / (1.0 - config.fast_share)
@@ -135,7 +131,6 @@ as it is now. A calibration leaves well below a hundredth (`calib.observer.confi
 class Floated:
     seconds: float
     """Of the link's clock [s]."""
-    cycles: int
     largest_torque: Array
     """(n,) [N·m]"""
     largest_speed: Array
@@ -209,7 +204,7 @@ class _Float:
         link.catch_up()
         self._sample = link.cycle(self._hold)
         self.position = self._sample.position.copy()
-        self._cycles, self._seconds = 0, 0.0
+        self._seconds = 0.0
         self._largest, self._fastest = np.zeros(link.n), np.zeros(link.n)
         self._low, self._high = np.full(link.n, np.inf), np.full(link.n, -np.inf)
 
@@ -239,7 +234,7 @@ class _Float:
             for sample in samples:
                 np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
                 torque = link.torque_sent
-                self._cycles, self._seconds = self._cycles + 1, sample.t - begin
+                self._seconds = sample.t - begin
                 self._largest = np.maximum(self._largest, np.abs(torque))
                 self._fastest = np.fmax(self._fastest, np.abs(sample.velocity))
                 self._low, self._high = np.minimum(self._low, self.position), np.maximum(self._high, self.position)
@@ -254,4 +249,4 @@ class _Float:
             self._link.cycle(here)
 
     def result(self) -> Floated:
-        return Floated(self._seconds, self._cycles, self._largest, self._fastest, self._high - self._low)
+        return Floated(self._seconds, self._largest, self._fastest, self._high - self._low)

@@ -210,6 +210,12 @@ def batch(readings: Sequence[StaticReading], sigma: ArrayLike) -> StaticReadings
     return replace(made, direction=stack(readings, "direction"))
 
 
+def slope(t: Array, values: Array) -> Array:
+    """Mean rate of change of values (K, …) over times (K,) [s], by least squares."""
+    centred = t - t.mean()
+    return np.asarray(centred @ (values - values.mean(axis=0)) / max(float(centred @ centred), 1e-12))
+
+
 def average(samples: Sequence[Sample], settled: bool) -> StaticReading:
     """Averages of samples; missing values are left out."""
     position, torque, motor = (stack(samples, name) for name in ("position", "torque", "motor_torque"))
@@ -256,8 +262,7 @@ def _reading(
     q, v, when = position[inside], torque[inside], t[inside]
     weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)
     weight /= weight.sum()
-    centred = when - when.mean()
-    speed = float(centred @ q[:, joint]) / max(float(centred @ centred), 1e-12)
+    speed = float(slope(when, q[:, joint]))
     if speed * side <= 0:
         return None
     mean_q, mean_v = weight @ q, weight @ v

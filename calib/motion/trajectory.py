@@ -51,10 +51,6 @@ def _trapezoid(t: Array, total: float, ramp: float) -> Array:
     return np.where(t < ramp, up, np.where(t <= total - ramp, level, down))
 
 
-SLOW_SETTLING = 0.5
-"""A joint under MIT gains settles so much later [s]: its host's integral term has to forget the torque of braking."""
-
-
 @dataclass(frozen=True)
 class WorkMotion:
     reach: float = 0.8
@@ -67,11 +63,6 @@ class WorkMotion:
     """[rad/s²]"""
     rest: float = 0.5
     """Rest at each waypoint [s]: settling and average of the rest detection, and a little more."""
-
-    @classmethod
-    def of_drives(cls, with_integral: bool) -> "WorkMotion":
-        """Work of an arm whose drives have an integral term, or of one whose host adds it: that one settles later."""
-        return cls() if with_integral else cls(rest=cls.rest + SLOW_SETTLING)
 
 
 TOUR = WorkMotion(reach=10.0)

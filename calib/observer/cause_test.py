@@ -95,7 +95,8 @@ class CauseTest:
         covariance = expected.covariance.copy()
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
         noise = (window.sigma**2).mean(axis=0)
-        self._of_model: list[float] = (1 - noise / (noise + expected.variance.mean(axis=0))).tolist()
+        self.of_model: Array = 1 - noise / (noise + expected.variance.mean(axis=0))
+        """Share of the model's own error in the variance of each joint's residuals (n,)."""
         self.found = ResidualTest(residual.ravel(), covariance, list(dictionary(belief.arm, belief.beta, window)))
         discrepancy = float(np.median(belief.level.total / belief.kernel.typical)) if belief.level.total.any() else 0.0
         self._inexact = min(discrepancy, INEXACT)
@@ -211,10 +212,6 @@ class CauseTest:
         index, entries = self.found.index(cause, joint), self.found.hypotheses
         rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
         return self.found.noticed(index, rivals, VERY_STRONG_EVIDENCE)
-
-    def of_model(self, joint: int) -> float:
-        """Share of the model's own error in the variance of a joint's residuals."""
-        return self._of_model[joint]
 
     def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
         """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""

@@ -5,11 +5,11 @@ reason given, and tests/campaigns/daemon_days.py bounds the result: time to find
 payloads recognised, no write in quiet work.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated
 
-Policy = Literal["observe", "propose", "apply"]
-"""Treatment of a drift: an event only, a proposal, or a new record written to the controller."""
+from pydantic import Field, FiniteFloat
+
+from armlink.arm_file import Section
 
 INITIAL_GAIN_STD = 5e-3
 """Standard deviation of a gain just installed: the accuracy asked of a calibration."""
@@ -25,40 +25,43 @@ LONGEST_WINDOW = 60
 that show whether a gain can be told, and poses remembered."""
 
 
-@dataclass(frozen=True)
-class ObserverConfig:
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+RowCount = Annotated[int, Field(ge=1)]
+
+
+class ObserverConfig(Section):
     """Settings that an arm or its work may need otherwise: the keys of `daemon.observer` in its file."""
 
-    still_band: float = 4e-3
+    still_band: NotNegative = 4e-3
     """The arm rests while no joint leaves this band [rad]. Over a rest of 0.4 s that is 0.01 rad/s on average, a fifth
     of the limit in §6, and it leaves room for a servo that hunts against friction; its jerks begin and end at rest, so
     that their torque averages out."""
-    settle_time: float = 0.1
+    settle_time: NotNegative = 0.1
     """Rest before averaging begins [s]: several time constants of the torque sensor's filter."""
-    average_time: float = 0.3
+    average_time: NotNegative = 0.3
     """Averaging time [s]: 75 samples at 250 Hz reduce sensor noise by a factor of nine."""
-    noise_share: float = 1e-3
+    noise_share: NotNegative = 1e-3
     """Initial standard deviation of one row, as a share of rated torque: half of one sample's noise of 0.2 %."""
-    alarm_gain: float = 0.01
+    alarm_gain: NotNegative = 0.01
     """Gain change that the CUSUM is tuned to (§6)."""
-    alarm_offset: float = 0.2
+    alarm_offset: NotNegative = 0.2
     """Offset change that the CUSUM is tuned to [N·m] (§6)."""
-    window: int = 20
+    window: RowCount = 20
     """Rows of one test (§6): with 20 rows 98 % of the verdicts of 200 rows are reached, in 40 s of motion."""
-    baseline_rows: int = 120
+    baseline_rows: RowCount = 120
     """Drift-free rows that drift is measured against: gravity model and discrepancy are adapted to them. Three minutes,
     in which a drift of 0.5 % an hour is 0.03 %."""
-    position_std: float = 1e-3
+    position_std: NotNegative = 1e-3
     """Standard deviation of a position sensor's zero [rad]; marginalised like the model's error."""
-    zero_wander: float = 3e-3
+    zero_wander: NotNegative = 3e-3
     """Most that a zero moves with temperature (standard deviation), as a share of rated torque: a sensor of class 0.15,
     three times worse than good ones, by 20 K. Where the arm's discrepancy is small, less is assumed."""
-    tool_windows: int = 60
+    tool_windows: RowCount = 60
     """Consecutive windows that find the same payload until it counts as a tool: half an hour of stops."""
-    gain_std: float = 3e-3
+    gain_std: NotNegative = 3e-3
     """A gain is written, and followed by the filter, only if the rows determine it to this standard deviation: 0.3 %
     (§6)."""
-    offset_std: float = 0.02
+    offset_std: NotNegative = 0.02
     """An offset is written only if its standard deviation is smaller [N·m] (§6)."""
-    rest_between_writes: float = 60.0
+    rest_between_writes: NotNegative = 60.0
     """At most one write per joint in this time [s] (T_min of §6)."""

@@ -93,7 +93,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids a write."""
     cause, refused = verdict.cause, []
     beside = verdict.other(joint)
-    wider = 1 + WIDER * test.of_model(joint)
+    wider = 1 + WIDER * float(test.of_model[joint])
     change, covariance = test.drift(joint, cause, beside)
     weak_lever = test.lever_share(joint) < MINIMUM_LEVER
     of_model = test.belief.level.total[joint]  # no worse than what the arm has anyway

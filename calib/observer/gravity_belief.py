@@ -173,11 +173,6 @@ class GravityBelief:
         """A sensor was corrected: rows from now on tell nothing of gains and offsets."""
         self._reference.close()
 
-    def forget(self) -> None:
-        """The discrepancy is another one: no rows are reference any more."""
-        self._reference.forget()
-        self._posterior = None
-
     def _fit_level(self, rows: Rows) -> None:
         if not self.level.before.any():
             return

@@ -17,10 +17,10 @@ from typing import Any, Self
 import numpy as np
 
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
-from calib.motion.static_reading import LEAST_SAMPLES
+from calib.motion.static_reading import LEAST_SAMPLES, slope
 from calib.observer.config import LONGEST_GAP
 from calib.observer.saved_values import known
-from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
+from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque, Parameter
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor
@@ -104,7 +104,7 @@ class PassageDetector:
         if len(times) < LEAST_SAMPLES:
             return []
         half = len(times) // 2
-        early, late = _speed(times[: half + 1], positions[: half + 1]), _speed(times[half:], positions[half:])
+        early, late = slope(times[: half + 1], positions[: half + 1]), slope(times[half:], positions[half:])
         velocity = (positions[-1] - positions[0]) / (times[-1] - times[0])
         side = np.where(np.abs(velocity) >= SLOWEST, np.sign(velocity), 0.0)
         turned = (side != 0) & (side != self._side)
@@ -121,13 +121,6 @@ class PassageDetector:
             Passage(when, int(j), here, float(pull[j]), float(velocity[j]), float(temperature[j]))
             for j in np.flatnonzero((side != 0) & onward & settled)
         ]
-
-
-def _speed(t: Array, position: Array) -> Array:
-    """Least-squares slope (n,) [rad/s]."""
-    centred = t - t.mean()
-    slope: Array = centred @ position / (centred @ centred)
-    return slope
 
 
 ZERO_STD = 2e-3
@@ -152,14 +145,17 @@ class MotorBelief:
 
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array) -> None:
         """Of records of creep sweeps; rated torques (n,) [N·m]."""
-        self.arm, self.rated, n = arm, rated, arm.n
+        self.arm, n = arm, arm.n
         doubt = MotorDoubt()  # of what the records do not hold
         motors = [_motor(joint.motor) for joint in calibration.joints]
         self._at = family_slices(n)
         self.mean = np.zeros(self._at["rho"].stop)
         std = np.zeros_like(self.mean)
         self.mean[self._at["gain"]] = 1.0
-        std[self._at["gain"]], std[self._at["offset"]], zero = _sensors(calibration, rated, doubt)
+        size = np.abs(calibration.values("gain", 1.0))
+        std[self._at["gain"]] = _known_std(calibration, "gain", doubt.gain) / size
+        std[self._at["offset"]] = _known_std(calibration, "offset", doubt.offset_share * rated) / size
+        zero = _known_std(calibration, "position_offset", 0.0)
         for family in ("coulomb", "load", "viscous", "asymmetry"):
             self.mean[self._at[family]], std[self._at[family]] = np.array([getattr(each, family) for each in motors]).T
         warming = np.array([each.gain_per_kelvin or (0.0, 0.0) for each in motors])
@@ -257,14 +253,7 @@ def _motor(motor: MotorTorque | None) -> MotorTorque:
     return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
 
 
-def _sensors(calibration: CalibrationRecord, rated: Array, doubt: MotorDoubt) -> tuple[Array, Array, Array]:
-    """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; where one is not known, what is
-    assumed before any sweep."""
-    known = {name: float(row[at]) ** 0.5 for at, (name, row) in enumerate(
-        zip(calibration.covariance_of, calibration.covariance, strict=True))}  # fmt: skip
-    gain, offset, zero = (np.empty(len(rated)) for _ in range(3))
-    for j, joint in enumerate(calibration.joints):
-        gain[j] = known.get(f"{joint.name}.gain", doubt.gain) / abs(joint.gain or 1.0)
-        offset[j] = known.get(f"{joint.name}.offset", doubt.offset_share * rated[j]) / abs(joint.gain or 1.0)
-        zero[j] = known.get(f"{joint.name}.position_offset", 0.0)
-    return gain, offset, zero
+def _known_std(calibration: CalibrationRecord, parameter: Parameter, before: Array | float) -> Array:
+    """Standard deviations (n,) of the record; where it has none, what is assumed before any sweep."""
+    std = calibration.std(parameter)
+    return np.where(np.isnan(std), before, std)

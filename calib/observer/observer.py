@@ -84,22 +84,6 @@ class Observer:
         """Whether an alarm is open: estimates are held until a verdict."""
         return self._investigation.held and not self._investigation.silent
 
-    @classmethod
-    def of_records(
-        cls,
-        arm: Arm,
-        calibration: CalibrationRecord,
-        gravity: GravityRecord,
-        rated_torque: Array,
-        config: ObserverConfig | None = None,
-    ) -> "Observer":
-        """Observer against these records; rated_torque (n,) [N·m] scales the noise assumed at first."""
-        config = config or ObserverConfig()
-        sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
-        position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-        level = DiscrepancyLevel.of_record(calibration, DISCREPANCY_SHARE * np.asarray(rated_torque, dtype=float))
-        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
-
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
         """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none.
 
@@ -286,17 +270,25 @@ class Observer:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
 
 
+AnyObserver = Observer | MovingObserver
+
+
 def observer_of(
     arm: Arm,
     calibration: CalibrationRecord,
     gravity: GravityRecord,
     rated_torque: Array,
     config: ObserverConfig | None = None,
-) -> Observer | MovingObserver:
+) -> AnyObserver:
     """The observer that suits the arm of these records: of rests, or, where torque is a motor current, of motion.
 
-    rated_torque (n,) [N·m]. Records of drives whose torque is a current have their friction.
+    rated_torque (n,) [N·m] scales the noise assumed at first. Records of drives whose torque is a current have their
+    friction.
     """
     if any(joint.motor is not None for joint in calibration.joints):
         return MovingObserver(arm, calibration, gravity, rated_torque)
-    return Observer.of_records(arm, calibration, gravity, rated_torque, config)
+    config, rated = config or ObserverConfig(), np.asarray(rated_torque, dtype=float)
+    position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
+    level = DiscrepancyLevel.of_record(calibration, DISCREPANCY_SHARE * rated)
+    beta, covariance = np.array(gravity.beta), np.array(gravity.covariance)
+    return Observer(arm, beta, covariance, config.noise_share * rated, config, *position, level)

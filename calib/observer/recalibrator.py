@@ -4,7 +4,7 @@ The check: at the arm's next rests, does the model fit worse than with the old c
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.install.check_motion import WORSE
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
-from calib.observer.config import ObserverConfig, Policy
+from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.rest_detector import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
@@ -100,7 +100,6 @@ class Recalibration:
     """New gain of the joint."""
     offset: float
     """New offset [N·m]."""
-    applied: bool
     undo: DriftFinding | None = None
     """After a roll-back of one joint: the change of its sensor, for `Observer.install`; None for a whole record."""
 
@@ -138,20 +137,15 @@ def recalibrated_record(
 
 
 class Recalibrator:
-    """Turns findings into records under a policy: observe keeps nothing, propose keeps, apply also writes."""
+    """Turns findings into records, and writes them."""
 
     def __init__(
-        self,
-        arm: ArmFile,
-        controllers: Controllers,
-        store: RecordStore,
-        policy: Policy,
-        current: CalibrationRecord | None = None,
+        self, arm: ArmFile, controllers: Controllers, store: RecordStore, current: CalibrationRecord | None = None
     ) -> None:
         """Start from the arm's current calibration record (default: as the store has it); raises Refused if none is."""
         current = current or store.required(CalibrationRecord, arm)
         self.record = current
-        self._arm, self._controllers, self._store, self._policy = arm, controllers, store, policy
+        self._arm, self._controllers, self._store = arm, controllers, store
         self._reference = self._swept(current)
         self._before = current.parent
         """Id of the record that `undo` goes back to."""
@@ -159,16 +153,11 @@ class Recalibrator:
         """Joints of the last write."""
         self._check: AfterWrite | None = None
 
-    def handle(self, finding: DriftFinding) -> Recalibration | None:
-        """Treat a finding as the policy demands; None under observe. Raises Refused, as propose and apply do."""
-        if self._policy == "observe":
-            return None
-        apply = self._policy == "apply"
-        proposed = self.propose(finding, by=APPLIED_BY if apply else None)
-        if not apply:
-            return proposed
+    def recalibrate(self, finding: DriftFinding) -> Recalibration:
+        """Propose and apply at once. Raises Refused, BusFault."""
+        proposed = self.propose(finding, by=APPLIED_BY)
         self.apply(proposed.record, finding.joint, by=APPLIED_BY)
-        return replace(proposed, applied=True)
+        return proposed
 
     def propose(self, finding: DriftFinding, by: str | None = None, ask: bool = True) -> Recalibration:
         """Keep the record that a finding leads to, without making it current; `by` is who confirms it, if anybody does.
@@ -182,7 +171,7 @@ class Recalibrator:
         admit_drift(new, self._reference, j, self._arm)
         self._store.add(new)
         pair = new.joints[j].torque_calibration(held)
-        return Recalibration(new.joints[j].name, new, pair.gain, pair.offset, False)
+        return Recalibration(new.joints[j].name, new, pair.gain, pair.offset)
 
     def apply(self, new: CalibrationRecord, j: int, by: str) -> None:
         """Write joint j of a kept record to its controller and make the record current.
@@ -247,7 +236,7 @@ class Recalibrator:
         self.record, self._before, self._written, self._check = parent, parent.parent, (), None
         whole = len(joints) > 1
         name = parent.joints[j].name
-        return Recalibration(name, parent, now.gain, now.offset, applied=True, undo=None if whole else undo)
+        return Recalibration(name, parent, now.gain, now.offset, None if whole else undo)
 
     def _require_current(self) -> None:
         """Raise Refused where the store has another record current than the one that is followed: it was exchanged, or

@@ -7,7 +7,7 @@ from armlink.errors import Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
 from calib.observer.decision import Event
-from calib.observer.observer import Observer
+from calib.observer.observer import AnyObserver
 from calib.observer.recalibrator import Recalibration, Recalibrator
 from gcomp.arrays import Array
 
@@ -26,15 +26,14 @@ class WatchHistory:
     events: list[Event] = field(default_factory=list)
     recalibrations: list[tuple[float, Recalibration]] = field(default_factory=list)
 
-    def first(self, kind: str, joint: str | None = None, after: float = 0.0) -> float | None:
-        """Time of the first event of a kind, on a joint or on any, from `after` on; None if there was none."""
-        of_kind = (event for event in self.events if event.kind == kind and event.t >= after)
-        return next((event.t for event in of_kind if joint in (None, event.joint)), None)
+    def first(self, kind: str, after: float = 0.0) -> float | None:
+        """Time of the first event of a kind from `after` on; None if there was none."""
+        return next((event.t for event in self.events if event.kind == kind and event.t >= after), None)
 
 
 def watch(
     link: ArmDriver,
-    observer: Observer,
+    observer: AnyObserver,
     targets: Iterable[Array],
     seconds: float,
     recalibrator: Recalibrator | None = None,
@@ -42,8 +41,8 @@ def watch(
 ) -> WatchHistory:
     """Run the arm along position targets (n,) [rad], one per cycle, for `seconds` of its clock, and observe.
 
-    Findings go to the recalibrator; the observer takes those that it writes as installed. `on_sample` sees each sample
-    and ends the watch by returning True. Raises BusFault.
+    The recalibrator writes what is found, and the observer takes it as installed; without one nothing is written.
+    `on_sample` sees each sample and ends the watch by returning True. Raises BusFault.
     """
     history, end = WatchHistory(), None
     for target in targets:
@@ -64,23 +63,20 @@ def watch(
     return history
 
 
-def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _recalibrate(event: Event, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
     assert event.finding is not None
     try:
-        outcome = recalibrator.handle(event.finding)
+        outcome = recalibrator.recalibrate(event.finding)
     except Refused as error:
         history.events.append(Event(event.t, "refused", event.joint, {"reason": str(error)}))
         return
-    if outcome is None:
-        return
     history.recalibrations.append((event.t, outcome))
-    evidence = {"record": outcome.record.id, "gain": outcome.gain, "offset": outcome.offset, "applied": outcome.applied}
+    evidence = {"record": outcome.record.id, "gain": outcome.gain, "offset": outcome.offset}
     history.events.append(Event(event.t, "recalibration", event.joint, evidence))
-    if outcome.applied:
-        observer.install(event.finding)
+    observer.install(event.finding)
 
 
-def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _check(sample: Sample, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
     """After a recalibration: take it back if it made the readings worse."""
     checked = recalibrator.sample(sample.t, sample.position, sample.torque)
     if checked is None or checked.verdict == "kept":
@@ -93,7 +89,7 @@ def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, histo
         observer.install(outcome.undo)
 
 
-def _keep(t: float, observer: Observer, history: WatchHistory) -> None:
+def _keep(t: float, observer: AnyObserver, history: WatchHistory) -> None:
     estimate = observer.estimate()
     history.t.append(t)
     for name in ("gain", "gain_std", "offset", "offset_std"):

@@ -183,5 +183,11 @@ def _between(start: Array | None, goal: Array, place: str) -> Iterator[tuple[str
     if start is None:
         yield place, goal
         return
-    for share in np.linspace(0, 1, POINTS + 1)[1:]:
-        yield place, start + share * (goal - start)
+    for pose in straight_way(start, goal)[1:]:
+        yield place, pose
+
+
+def straight_way(begin: Array, end: Array) -> Array:
+    """Poses (…, POINTS + 1, n) [rad] from one pose to another, ends included (…, n)."""
+    shares = np.linspace(0, 1, POINTS + 1)[:, None]
+    return begin[..., None, :] + shares * (end - begin)[..., None, :]

@@ -11,12 +11,10 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
-from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.collisions import POINTS, Geometry
+from calib.plan.collisions import POINTS
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
-from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
-from calib.plan.sweep_options import COLLIDING, require_range
+from calib.plan.planned_arm import COLLIDING, PlannedArm
+from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, guess_of_file, is_vertical, known_lever
 from calib.plan.sweep_plan import MASS_SHARES
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
@@ -24,7 +22,7 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.estimate.posterior import invert
 from gcomp.gravity.torque import gravity_levers, gravity_regressor
-from gcomp.identify.motor_model import MotorDoubt, MotorModel, family_slices
+from gcomp.identify.motor_model import MotorModel, family_slices
 from gcomp.identify.readings import StaticReadings
 
 SCATTER_SHARE = 0.003
@@ -53,22 +51,22 @@ class CreepCandidate:
 
 
 def choose(
-    arm: Arm, beta: Array, rated: Array, candidates: list[list[CreepCandidate]], count: int, speeds: tuple[float, ...],
-    mass: float, doubt: MotorDoubt,
-) -> tuple[list[list[CreepCandidate]], Array]:  # fmt: skip
-    """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
+    creeping: "CreepingArm", candidates: list[list[CreepCandidate]], mass: float
+) -> tuple[list[list[CreepCandidate]], Array]:
+    """(Candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
 
     Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
-    beta (2n,) [kg·m] is a guess of the mass moments.
     """
-    mean, std = doubt.prior(arm, rated, True, 0.02 * rated)
+    arm, rated, section = creeping.arm, creeping.limits.rated, creeping.section
+    mean, std = section.motor_doubt.prior(arm, rated, True, 0.02 * rated)
     x, at = mean.copy(), family_slices(arm.n)
-    x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05
+    x[at["beta"]], x[at["coulomb"]], x[at["load"]] = creeping.beta, 0.02 * rated, 0.05
     information = np.diag(1 / std**2)
-    rows = [[_information(arm, x, one, speeds[0], mass, rated) for one in each] for each in candidates]
+    speed = section.creep.speeds[0]
+    rows = [[_information(arm, x, one, speed, mass, rated) for one in each] for each in candidates]
     chosen: list[list[CreepCandidate]] = [[] for _ in candidates]
     gains = at["gain"]
-    for _ in range(count):
+    for _ in range(section.creep.poses):
         for place, each in enumerate(candidates):
             costs = [float(np.diag(invert(information + one))[gains].sum()) for one in rows[place]]
             best = int(np.argmin(costs))
@@ -116,44 +114,27 @@ SETTLE = 0.4
 """Time after that in which friction has turned round and the position loop has settled [s]."""
 
 
-@dataclass(frozen=True, eq=False)
-class CreepGround:
-    """Arm, limits and surroundings in which creeps are planned."""
+class CreepingArm(PlannedArm):
+    """An arm in whose plan joints creep."""
 
-    arm: Arm
-    section: SweepSection
-    limits: DriveLimits
-    beta: Array
-    """Guess of the mass moments (2n,) [kg·m]."""
-    geometry: Geometry | None
-    weighed: bool = True
-    """Whether `beta` is of a model file."""
-
-    @classmethod
-    def of(cls, arm_file: ArmFile) -> "CreepGround":
+    def __init__(self, arm_file: ArmFile) -> None:
         """Raises BadInput where a range is too short or the model cannot be used."""
-        arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
-        require_range(section, limits, arm)
-        if arm_file.model_path is None:
-            share = 0.2 * limits.rated / float(np.linalg.norm(arm.gravity))
-            return cls(arm, section, limits, np.column_stack([share, 0 * share]).ravel(), None, weighed=False)
-        geometry = Geometry(arm_file)
-        return cls(arm, section, limits, model_arm(arm_file).beta, geometry if geometry.model.ngeom else None)
+        super().__init__(arm_file, guess_of_file(arm_file))
+        self.require_range()
+
+    @property
+    def beta(self) -> Array:
+        """Guess of the mass moments (2n,) [kg·m]."""
+        if self.guess is not None:
+            return self.guess.beta
+        share = 0.2 * self.limits.rated / float(np.linalg.norm(self.arm.gravity))
+        return np.column_stack([share, 0 * share]).ravel()
 
     @property
     def ends(self) -> tuple[Array, Array]:
         """Lower and upper ends of the joints' ways (n,) [rad]; twice the doubt of the zero away from the stops."""
         margin = self.section.range_margin + 2 * self.section.creep.zero_std
         return self.limits.lower + margin, self.limits.upper - margin
-
-    def free(self, poses: Array) -> bool:
-        """Whether nothing touches at any of the poses (K, n) [rad]."""
-        return self.geometry is None or bool(self.geometry.free(poses).all())
-
-    def way(self, begin: Array, end: Array) -> bool:
-        """Whether nothing touches on the straight way between two poses (n,) [rad]."""
-        shares = np.linspace(0, 1, POINTS + 1)[:, None]
-        return self.free(begin + shares * (end - begin))
 
     def mass(self) -> float:
         """Reference mass to attach [kg]."""
@@ -165,7 +146,7 @@ class CreepGround:
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
-        share = MASS_SHARES[0] if self.weighed else BLIND_SHARE
+        share = BLIND_SHARE if self.guess is None else MASS_SHARES[0]
         most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
         return float(f"{float(most.min()):.2g}")
 
@@ -179,56 +160,54 @@ class CreepGround:
 
 def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     """The sweeps of one pass; every pass of an arm has the same ones. Raises BadInput where the arm cannot be swept."""
-    ground = CreepGround.of(arm_file)
-    creep, n, mass = ground.section.creep, ground.arm.n, ground.mass()
+    creeping = CreepingArm(arm_file)
+    creep, n, mass = creeping.section.creep, creeping.arm.n, creeping.mass()
     random = np.random.default_rng([seed, 19])
-    home = _home(ground, random)
-    lists = [_candidates(ground, joint, home, mass, random) for joint in reversed(range(n))]
-    chosen, promised = choose(
-        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, ground.section.motor_doubt
-    )
+    home = _home(creeping, random)
+    lists = [_candidates(creeping, joint, home, mass, random) for joint in reversed(range(n))]
+    chosen, promised = choose(creeping, lists, mass)
     sweeps = []
     for each in chosen:
         for number, one in enumerate(each):
-            sweeps.append(_sweep(ground, one, number, creep.speeds[number % len(creep.speeds)]))
-    blind = [ground.arm.names[joint] for joint in range(n) if is_vertical(ground.arm, joint)]
+            sweeps.append(_sweep(creeping, one, number, creep.speeds[number % len(creep.speeds)]))
+    blind = [creeping.arm.names[joint] for joint in range(n) if is_vertical(creeping.arm, joint)]
     notes = tuple(f"{name}: {VERTICAL}" for name in blind)
-    if ground.section.known_point is None and known_lever(ground.arm) < SHORTEST:
+    if creeping.section.known_point is None and known_lever(creeping.arm) < SHORTEST:
         notes = (*notes, f"{arm_file.name}: {NO_LEVER}")
     return SweepPlan(
         sweeps=tuple(sweeps),
         scout=(tuple(home.tolist()),),
         reference_mass=mass,
-        standard_error=ground.section.standard_error,
-        travel_acceleration=min(ground.section.acceleration, TRAVEL_ACCELERATION),
-        gain_std=float(promised[[j for j in range(n) if ground.arm.names[j] not in blind]].max(initial=0.0)),
+        standard_error=creeping.section.standard_error,
+        travel_acceleration=min(creeping.section.acceleration, TRAVEL_ACCELERATION),
+        gain_std=float(promised[[j for j in range(n) if creeping.arm.names[j] not in blind]].max(initial=0.0)),
         notes=notes,
     )
 
 
 def refuse_unbearable_creeps(arm_file: ArmFile, mass: float) -> None:
     """Raise BadInput, naming the joint, where the drives cannot hold a reference mass [kg] in any creep."""
-    ground = CreepGround.of(arm_file)
+    creeping = CreepingArm(arm_file)
     random = np.random.default_rng(0)
-    home = _home(ground, random)
-    for joint in range(ground.arm.n):
-        _candidates(ground, joint, home, mass, random)
+    home = _home(creeping, random)
+    for joint in range(creeping.arm.n):
+        _candidates(creeping, joint, home, mass, random)
 
 
-def check_creep_limits(ground: CreepGround, arm_file: ArmFile, plan: SweepPlan) -> None:
+def check_creep_limits(creeping: CreepingArm, arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
-    require_bounds(arm_file, plan, PoseBounds(ground.ends, ground.ends, ground.ends))
-    refuse_unfit(arm_file, _unfit(ground, plan))
+    require_bounds(arm_file, plan, PoseBounds(creeping.ends, creeping.ends, creeping.ends))
+    refuse_unfit(arm_file, _unfit(creeping, plan))
 
 
-def _unfit(ground: CreepGround, plan: SweepPlan) -> Iterator[str]:
-    mass, (lowest, highest) = ground.mass(), ground.ends
-    most = min(ground.section.acceleration, TRAVEL_ACCELERATION)
+def _unfit(creeping: CreepingArm, plan: SweepPlan) -> Iterator[str]:
+    mass, (lowest, highest) = creeping.mass(), creeping.ends
+    most = min(creeping.section.acceleration, TRAVEL_ACCELERATION)
     if not 0 < plan.travel_acceleration <= most * (1 + ROUNDING):
         yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {most:g}"
     for sweep in plan.sweeps:
         speed, (lower, upper) = creep_speed(sweep), creep_ends(sweep)
-        fastest = min(max(ground.section.creep.speeds), ground.limits.speed[sweep.joint])
+        fastest = min(max(creeping.section.creep.speeds), creeping.limits.speed[sweep.joint])
         if speed > fastest * (1 + ROUNDING):
             yield f"sweep {sweep.name}: speed is {speed:g} rad/s, expected at most {fastest:g} rad/s"
         low, high = lowest[sweep.joint], highest[sweep.joint]
@@ -237,7 +216,7 @@ def _unfit(ground: CreepGround, plan: SweepPlan) -> Iterator[str]:
                 f"sweep {sweep.name} goes from {lower:.4g} to {upper:.4g} rad: it must stay between {low:.4g} "
                 f"and {high:.4g} rad"
             )
-        if not ground.bearable(CreepCandidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
+        if not creeping.bearable(CreepCandidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
             yield f"sweep {sweep.name}: with {mass:g} kg, a drive cannot hold its joint in this sweep within max_torque"
 
 
@@ -270,58 +249,58 @@ def creep_ends(sweep: Sweep) -> tuple[float, float]:
     return middles[0] - half, middles[-1] + half
 
 
-def _sweep(ground: CreepGround, one: CreepCandidate, number: int, speed: float) -> Sweep:
+def _sweep(creeping: CreepingArm, one: CreepCandidate, number: int, speed: float) -> Sweep:
     speed = min(speed, (one.upper - one.lower) / 4 / lead_way(1.0))
     lead = lead_way(speed)
     way = one.upper - one.lower - 2 * lead
-    count = max(round(way / ground.section.creep.bin), 4)
+    count = max(round(way / creeping.section.creep.bin), 4)
     width = way / count
     no_stop: Side = 0
     rest = one.rest.copy()
     rest[one.joint] = one.lower
-    lever = gravity_levers(ground.arm, one.poses(3))[:, one.joint].max() / np.linalg.norm(ground.arm.gravity)
+    lever = gravity_levers(creeping.arm, one.poses(3))[:, one.joint].max() / np.linalg.norm(creeping.arm.gravity)
     return Sweep(
-        name=f"{ground.arm.names[one.joint]} creep {number + 1}",
+        name=f"{creeping.arm.names[one.joint]} creep {number + 1}",
         joint=one.joint,
-        stops=tuple(no_stop for _ in range(ground.arm.n)),
+        stops=tuple(no_stop for _ in range(creeping.arm.n)),
         rest=tuple(rest.tolist()),
         steps=tuple((one.lower + lead + width * (np.arange(count) + 0.5)).tolist()),
         lever=float(lever),
-        servo=(True,) * ground.arm.n,
+        servo=(True,) * creeping.arm.n,
         speed=speed,
     )
 
 
-def _home(ground: CreepGround, random: np.random.Generator) -> Array:
+def _home(creeping: CreepingArm, random: np.random.Generator) -> Array:
     """A pose from which creeps are reached: the middle of the ranges, or the first free one drawn."""
-    middle = np.asarray(np.mean(ground.ends, axis=0))
-    if ground.free(middle[None]):
+    middle = np.asarray(np.mean(creeping.ends, axis=0))
+    if creeping.free(middle[None]).all():
         return middle
     for _ in range(20 * DRAWS):
-        pose = random.uniform(*ground.ends)
-        if ground.free(pose[None]):
+        pose = random.uniform(*creeping.ends)
+        if creeping.free(pose[None]).all():
             return np.asarray(pose)
     raise BadInput(COLLIDING)
 
 
 def _candidates(
-    ground: CreepGround, joint: int, home: Array, mass: float, random: np.random.Generator
+    creeping: CreepingArm, joint: int, home: Array, mass: float, random: np.random.Generator
 ) -> list[CreepCandidate]:
-    lowest, highest = ground.ends
+    lowest, highest = creeping.ends
     low, high = float(lowest[joint]), float(highest[joint])
-    span, found = min(high - low, ground.section.creep.span), list[CreepCandidate]()
+    span, found = min(high - low, creeping.section.creep.span), list[CreepCandidate]()
     for _ in range(CANDIDATES * DRAWS):
         lower = random.uniform(low, high - span) if high - low > span else low
         one = CreepCandidate(joint, random.uniform(lowest, highest), lower, lower + span)
         begin = one.poses(2)[0]
-        clear = ground.free(one.poses(POINTS + 1)) and ground.way(home, begin)
-        if clear and ground.bearable(one, mass):
+        clear = creeping.free(one.poses(POINTS + 1)).all() and creeping.is_clear(home, begin)
+        if clear and creeping.bearable(one, mass):
             found.append(one)
             if len(found) == CANDIDATES:
                 break
     if not found:
         raise BadInput(
-            f"joint {ground.arm.names[joint]}: no creep of {span:.2f} rad is free of collisions and within "
+            f"joint {creeping.arm.names[joint]}: no creep of {span:.2f} rad is free of collisions and within "
             f"max_torque with {mass:g} kg: shorten sweep.creep.span, choose a smaller sweep.reference_mass, "
             "or narrow lower and upper of the other joints in the arm file"
         )

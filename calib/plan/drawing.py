@@ -9,12 +9,11 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.content.atomic_file import write_whole
 from armlink.content.printable_text import printable_text
-from calib.arm.kinematics import DriveLimits, gcomp_arm
+from calib.arm.kinematics import DriveLimits, frame_origins, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
 from calib.plan.collisions import sweep_ends
 from calib.plan.types import SCOUT_TITLE, SweepPlan
-from gcomp.arm.arm import Arm, bar_frames
 from gcomp.arrays import Array
 
 PRESS, READ = 1.0, 0.5
@@ -23,15 +22,6 @@ SPEED_UP, STOP_CREEP = 0.3, 0.8
 """Seconds lost to speeding up and slowing down on a way, and for creeping onto a stop and off it again: estimates."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
 """One per joint."""
-
-
-def frame_origins(kinematics: Arm, q: Array) -> Array:
-    """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
-    rotation = bar_frames(kinematics, q).rotation
-    along = np.einsum("knij,nj->kni", rotation, kinematics.span)
-    places = np.zeros((len(q), kinematics.n + 1, 3))
-    places[:, 1:] = np.cumsum(along, axis=1)
-    return places
 
 
 def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:

@@ -11,8 +11,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.arm.kinematics import DriveLimits
-from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.sweep_options import FASTEST, SLOWEST, sweep_range
+from calib.plan.planned_arm import FASTEST, SLOWEST, PlannedArm
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
@@ -36,12 +35,12 @@ class PoseBounds:
 
 def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of static readings leaves the arm file's limits."""
-    section, limits = sweep_section(arm_file), DriveLimits.of(arm_file)
-    ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))]).T
+    planned = PlannedArm(arm_file)
+    limits, ends = planned.limits, np.array([planned.sweep_range(joint) for joint in range(planned.arm.n)]).T
     stops = (limits.lower, limits.upper)
     held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
     require_bounds(arm_file, plan, PoseBounds((ends[0], ends[1]), held, stops))
-    refuse_unfit(arm_file, _of_drives(plan, section, limits, arm_file.joint_names))
+    refuse_unfit(arm_file, _of_drives(plan, planned))
 
 
 def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
@@ -108,16 +107,16 @@ def _beyond(where: str, pose: Array, lower: Array, upper: Array, names: Sequence
         yield f"{where}: {names[k]} is at {pose[k]:.4g} rad, expected {lower[k]:.4g} to {upper[k]:.4g} rad"
 
 
-def _of_drives(plan: SweepPlan, section: SweepSection, limits: DriveLimits, names: Sequence[str]) -> Iterator[str]:
+def _of_drives(plan: SweepPlan, planned: PlannedArm) -> Iterator[str]:
     if not 0 < plan.travel_acceleration <= FASTEST * (1 + ROUNDING):
         yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {FASTEST:g}"
-    fastest = max(section.acceleration, SLOWEST)
+    fastest = max(planned.section.acceleration, SLOWEST)
     for sweep in plan.sweeps:
         if sweep.speed is not None:
             yield f"sweep {sweep.name} is a creep sweep, but this is a plan of readings at rest"
         if not 0 < sweep.acceleration <= fastest * (1 + ROUNDING):
             yield f"sweep {sweep.name}: acceleration is {sweep.acceleration:g} rad/s², expected at most {fastest:g}"
-        yield from _of_bias(sweep, limits, names)
+        yield from _of_bias(sweep, planned.limits, planned.arm.names)
 
 
 def _of_bias(sweep: Sweep, limits: DriveLimits, names: Sequence[str]) -> Iterator[str]:

@@ -9,23 +9,11 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.kinematics import DriveLimits
 from calib.plan.plan_limits import SERVO_GAP
+from calib.plan.planned_arm import SLOWEST, PlannedArm
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments
-from calib.plan.sweep_options import (
-    PlannedArm,
-    Poses,
-    bias_and_acceleration,
-    hold_torque,
-    pressable_joints,
-    reaction_bound,
-    required_bias,
-    scout_poses,
-    sweep_options,
-    sweep_range,
-    travel_acceleration,
-)
+from calib.plan.sweep_options import Poses, scout_poses, sweep_options
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -133,17 +121,16 @@ def plan_sweep(
     and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Raises BadInput if a
     joint's range is too short to sweep or no combination can be held.
     """
-    planned = PlannedArm.of(arm_file, guess)
+    planned = PlannedArm(arm_file, guess).require_range()
     section, goal = planned.section, planned.section.gain_std
     options, notes = sweep_options(planned)
-    moments = guessed_moments(planned.kinematics, seed) if guess is None else [guess.beta]
+    reached = np.concatenate([each.poses.reshape(-1, planned.arm.n) for each in options])
+    moments = guessed_moments(planned.arm, seed) if guess is None else [guess.beta]
     given = reference_mass or section.reference_mass
-    masses = [given] if given else reference_masses(planned.kinematics, planned.limits, options, guess)
+    masses = [given] if given else reference_masses(planned, reached)
     poses = section.loaded_poses if reference_mass else section.poses
-    scout = scout_poses(planned.kinematics, section, planned.limits, seed, planned.geometry)
-    design = StopDesign.of(
-        planned.kinematics, options, moments, section.standard_error * planned.limits.rated, masses[-1]
-    )
+    scout = scout_poses(planned, seed)
+    design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
     tried = []
     for more in range(MORE_POSES + 1):
         sweeps = _choose(planned, design, poses + more)
@@ -165,7 +152,7 @@ def plan_sweep(
         scout=scout,
         reference_mass=mass,
         standard_error=section.standard_error / finer,
-        travel_acceleration=travel_acceleration(planned.limits, options, guess),
+        travel_acceleration=planned.travel_acceleration(reached),
         gain_std=None if gain_std is None else gain_std / finer,
         notes=tuple(notes),
     )
@@ -177,12 +164,12 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
     `guess` is of the arm alone; without one, gravity counts as nothing. Where the mass hangs beyond the flange is not
     known and counts as nothing, too.
     """
-    planned, most = PlannedArm.of(arm_file, guess), {}
+    planned, most = PlannedArm(arm_file, guess).require_range(), {}
     for options in sweep_options(planned)[0]:
         own = 0.0 if guess is None else np.abs(guess.torque(options.poses))
         room = planned.limits.max_torque - own
-        bearable = (room / _torque_per_kilogram(planned.kinematics, options.poses)).min(axis=(1, 2))
-        most[planned.kinematics.names[options.joint]] = max(float(bearable.max()), 0.0)
+        bearable = (room / _torque_per_kilogram(planned.arm, options.poses)).min(axis=(1, 2))
+        most[planned.arm.names[options.joint]] = max(float(bearable.max()), 0.0)
     name = min(most, key=lambda joint: most[joint])
     if mass > most[name]:
         unit = f"; or do you mean {mass / 1000:g} kg?" if mass >= GRAMS and mass / 1000 < most[name] else ""
@@ -196,7 +183,7 @@ def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep,
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in design.candidates]
     picks = design.choose(counts, planned.section.travel_speed * planned.limits.speed)
     return tuple(
-        _sweep(planned, f"{planned.kinematics.names[each.joint]}.{number}", each, pick)
+        _sweep(planned, f"{planned.arm.names[each.joint]}.{number}", each, pick)
         for each, chosen in zip(design.candidates, picks, strict=True)
         for number, pick in enumerate(chosen, start=1)
     )
@@ -212,7 +199,7 @@ def _lightest(
     if planned.guess is None:
         return masses[-1], None
     section = planned.section
-    rounding = np.zeros(planned.kinematics.n) if resolution is None else resolution / np.sqrt(12.0)
+    rounding = np.zeros(planned.arm.n) if resolution is None else resolution / np.sqrt(12.0)
     for mass in masses:
         std = predicted_gain_std(
             planned.guess,
@@ -233,7 +220,7 @@ def _lightest(
 def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sweep:
     section, limits = planned.section, planned.limits
     joint, stops = options.joint, options.stops[pick]
-    steps = np.linspace(*sweep_range(section, limits, joint), section.steps)
+    steps = np.linspace(*planned.sweep_range(joint), section.steps)
     servo, bias, acceleration = _hold(planned, options.kept(np.arange(options.count) == pick))
     rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
     rest[joint] = steps[0]
@@ -251,44 +238,53 @@ def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sw
 
 
 def _hold(planned: PlannedArm, one: Candidates) -> tuple[Mask, Array | None, float]:
-    """(Joints held by servo (n,), signed bias torques of the others (n,) [N·m], acceleration [rad/s²]) at `one`."""
-    section, limits, guess = planned.section, planned.limits, planned.guess
+    """(Joints held by servo (n,), signed bias torques of the others (n,) [N·m], acceleration [rad/s²]) at `one`.
+
+    The acceleration is the largest that every joint's torque allows: a servo-held joint resists the swept one's
+    reaction with its torque beyond gravity, and the swept joint accelerates with half of it.
+    """
+    section, limits = planned.section, planned.limits
     joint, stops = one.joint, one.stops[0]
     resting = stops != 0
     servo = resting & (section.hold == "servo")
-    if guess is None:
+    if planned.guess is None:
         return servo, None, section.acceleration
-    servo = servo | (resting & ~pressable_joints(guess, section, limits, one)[0])
-    needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
-    least, largest, _ = hold_torque(guess, section, limits, one.poses)
-    spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]
+    servo = servo | (resting & ~planned.pressable_joints(one)[0])
     pressed = resting & ~servo
-    reaction = reaction_bound(guess, joint)
-    size, acceleration = bias_and_acceleration(needed, spare, reaction, pressed, section, limits, joint)
+    needed, reaction = planned.required_bias(one)[0], planned.reaction_bound(joint)
+    least, largest, _ = planned.hold_torque(one.poses)
+    spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]
+    left = np.where(pressed, planned.given_bias - needed, spare)
+    left[joint] = spare[joint] / 2
+    acceleration = float(np.clip((left / np.maximum(reaction, 1e-9)).min(), SLOWEST, section.acceleration))
+    size = planned.given_bias
+    if section.bias_torque is None:
+        size = np.minimum(needed + acceleration * reaction, limits.max_torque)
     return servo, stops * np.where(pressed, size, 0.0), acceleration
 
 
-def reference_masses(
-    kinematics: Arm, limits: DriveLimits, options: list[Candidates], guess: GravityGuess | None
-) -> list[float]:
-    """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
-    poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])
-    per_kg = _torque_per_kilogram(kinematics, poses, HAND)
+def reference_masses(planned: PlannedArm, poses: Array) -> list[float]:
+    """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits.
+
+    `poses` (K, n) [rad] are those of all sweeps that may be planned.
+    """
+    limits, guess = planned.limits, planned.guess
+    per_kg = _torque_per_kilogram(planned.arm, poses, HAND)
     gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
     most = float(np.min(room / per_kg.max(axis=0)))
-    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
-    on_the_way = np.inf if guess is None else _bearable_on_the_way(kinematics, limits, guess, poses, most)
+    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(planned.arm)[0])))
+    on_the_way = np.inf if guess is None else _bearable_on_the_way(limits.max_torque, guess, poses, most)
     return [float(f"{min(share * most, on_the_way):.2g}") for share in MASS_SHARES]
 
 
-def _bearable_on_the_way(kinematics: Arm, limits: DriveLimits, guess: GravityGuess, poses: Array, most: float) -> float:
+def _bearable_on_the_way(max_torque: Array, guess: GravityGuess, poses: Array, most: float) -> float:
     """Mass [kg] that the drives hold with `HOLDING_RESERVE` on straight ways from one sweep's poses to another's."""
     random = np.random.default_rng(0)
     begin, end = poses[random.integers(len(poses), size=(2, TRAVEL_POSES))]
     way = begin + random.uniform(size=(TRAVEL_POSES, 1)) * (end - begin)
-    room = limits.max_torque / HOLDING_RESERVE - np.abs(guess.torque(way))
-    return max(float(np.min(room / _torque_per_kilogram(kinematics, way, HAND))), MASS_SHARES[0] * most / 2)
+    room = max_torque / HOLDING_RESERVE - np.abs(guess.torque(way))
+    return max(float(np.min(room / _torque_per_kilogram(guess.kinematics, way, HAND))), MASS_SHARES[0] * most / 2)
 
 
 def _torque_per_kilogram(kinematics: Arm, poses: Array, hand: float = 0.0) -> Array:

@@ -42,8 +42,11 @@ ACTIVATIONS = sa.Table("activations", TABLES, *_of_a_record(), *_texts("kind", "
 WRITES = sa.Table("writes", TABLES, *_of_a_record(), *_texts("arm", "serial", "at", "by", "stage"), _body())
 """Journal of writes to controllers: stage `begun` with the calibrations held before, then `finished` or `undone`."""
 
-MIGRATIONS = ("0001", "0002")
-"""Revisions of the schema, oldest first; the last one makes the tables above."""
+REVISIONS = {"0001": (RECORDS, ACTIVATIONS), "0002": (WRITES,)}
+"""Revision of the schema → the tables that it brought, oldest first."""
+HEAD = max(REVISIONS)
+VERSION = sa.Table("alembic_version", TABLES, sa.Column("version_num", sa.String(32), primary_key=True))
+"""The revision of a store; stores of earlier versions were made by Alembic."""
 
 
 def append_only(table: str, dialect: str) -> list[str]:
@@ -65,7 +68,6 @@ def append_only(table: str, dialect: str) -> list[str]:
     return []
 
 
-HEAD = MIGRATIONS[-1]
 BUSY_SECONDS = 10
 """Wait for another writer of an SQLite store [s]."""
 _POSTGRESQL = {
@@ -76,7 +78,6 @@ _POSTGRESQL = {
     "options": "-c statement_timeout=10000",
 }
 """Of libpq: how long it waits for a connection, and how long the server may work [s, s, s, –, ms]."""
-_VERSION = "alembic_version"
 _FILE = "file"
 """Key of a connection's notes: the identity of the file that it holds open."""
 FileIdentity = tuple[int, int] | None
@@ -217,7 +218,7 @@ def _store_name(engine: sa.Engine) -> str:
 
 
 def _migrate(engine: sa.Engine) -> None:
-    """Migrate the schema to HEAD; a store older than migrations has the tables of 0001 and no version."""
+    """Make the tables that the store lacks, up to HEAD; the oldest stores have those of 0001 and no revision."""
     with engine.connect() as connection:
         if _version(connection) == HEAD:
             return
@@ -226,24 +227,20 @@ def _migrate(engine: sa.Engine) -> None:
         found = _version(connection)
         if found == HEAD:  # another process was first
             return
-        if found is not None and found not in MIGRATIONS:
+        if found is not None and found not in REVISIONS:
             raise BadInput(
                 f"{_store_name(engine)}: its schema {found} is newer than schema {HEAD} of this armlink, so "
                 "nothing was changed: install a newer armlink"
             )
-        _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))
-
-
-def _upgrade(connection: sa.Connection, stamp: bool) -> None:
-    from alembic import command
-    from alembic.config import Config
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-    config.attributes["connection"] = connection
-    if stamp:
-        command.stamp(config, "0001")
-    command.upgrade(config, HEAD)
+        if found is None and sa.inspect(connection).has_table(RECORDS.name):
+            found = "0001"
+        for table in (each for revision, tables in REVISIONS.items() if revision > (found or "") for each in tables):
+            table.create(connection)
+            for statement in append_only(table.name, connection.dialect.name):
+                connection.exec_driver_sql(statement)
+        VERSION.create(connection, checkfirst=True)
+        connection.execute(VERSION.delete())
+        connection.execute(VERSION.insert().values(version_num=HEAD))
 
 
 def _lock(connection: sa.Connection) -> None:
@@ -252,9 +249,9 @@ def _lock(connection: sa.Connection) -> None:
 
 
 def _version(connection: sa.Connection) -> str | None:
-    if not sa.inspect(connection).has_table(_VERSION):
+    if not sa.inspect(connection).has_table(VERSION.name):
         return None
-    return connection.execute(sa.text(f"SELECT version_num FROM {_VERSION}")).scalar()
+    return connection.execute(sa.select(VERSION)).scalar()
 
 
 def _full_url(url: str) -> str:

@@ -94,16 +94,17 @@ class RecordStore:
         """
         return require_sound(self.get(record_id).require(arm), arm, now)
 
-    def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
+    def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> None:
         """Make a kept record the current one of its kind; raises Refused if it is of another arm, or not sound."""
         record = self.usable(record_id, arm, datetime.now(UTC))
         with transaction(self._engine) as connection:
-            return _activate(connection, record, arm, by, reason)
+            _activate(connection, record, arm, by, reason)
 
     def put(self, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> str:
         """Append a record and make it current; returns its id. One that is not sound is kept, and Refused raised."""
         self.add(record.require(arm))
-        return self.activate(record.id, arm, by, reason).record
+        self.activate(record.id, arm, by, reason)
+        return record.id
 
     def former(self, arm: ArmFile, record_id: str) -> AnyRecord:
         """A record that was current before and is not now; raises Refused if there is none, or it is of another arm."""
@@ -117,9 +118,9 @@ class RecordStore:
             raise Refused(f"record {record_id} is current on {arm.name} {arm.serial} already")
         return record
 
-    def rollback(self, arm: ArmFile, to: str, by: str, reason: str = "rollback") -> Activation:
+    def rollback(self, arm: ArmFile, to: str, by: str, reason: str = "rollback") -> None:
         """Return to a record that was current before; raises Refused if it never was, or is now."""
-        return self.activate(self.former(arm, to).id, arm, by, reason)
+        self.activate(self.former(arm, to).id, arm, by, reason)
 
     def current(self, kind: type[R], arm: ArmFile) -> R | None:
         """The current record of a kind; None if there is none yet.
@@ -261,11 +262,10 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> Activation:
+def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> None:
     row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
     row |= {"reason": reason, "at": _now()}
-    number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
-    return Activation(number, record.id, record.kind, row["at"], by, reason)
+    connection.execute(ACTIVATIONS.insert().values(row))
 
 
 def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.dataset import SweepData
+from calib.fit.calibration import rms
 from calib.fit.creep_fit import CreepFit
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
@@ -134,17 +135,19 @@ def _comparison(done: Calibrated, fit: SensorFit) -> ReportSection:
         old, label = manifest.installed, "the calibration in the drives"
     else:
         old, label = before.torque_calibration(UNCALIBRATED), f"record {before.id}"
-    rms = [_rms_of_pair(done, fit, pair) for pair in (old, record.torque_calibration(old))]
-    shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
+    before_rms, now_rms = (_rms_of_pair(done, fit, pair) for pair in (old, record.torque_calibration(old)))
+    shown = np.isfinite(before_rms) & np.isfinite(now_rms)
     text = (
         "Calibrated torque minus model torque over all readings without load, with the calibration used "
         "until now and with the new calibration."
     )
     figures = []
     if shown.any():
-        figures.append(before_after_figure(tuple(np.array(names)[shown].tolist()), rms[0][shown], rms[1][shown], label))
+        figures.append(
+            before_after_figure(tuple(np.array(names)[shown].tolist()), before_rms[shown], now_rms[shown], label)
+        )
     header = ("joint", f"RMS with {label} [N·m]", "RMS now [N·m]")
-    rows = [[names[j], _number(rms[0][j], ".4f"), _number(rms[1][j], ".4f")] for j in range(n)]
+    rows = [[names[j], _number(before_rms[j], ".4f"), _number(now_rms[j], ".4f")] for j in range(n)]
     tables = [ReportTable(header, rows)]
     if before is not None:
         tables.append(_changes(before, record))
@@ -179,10 +182,7 @@ def _rms_of_pair(done: Calibrated, fit: SensorFit, pair: TorqueCalibration[Array
     counted = np.isfinite(rows.readings.torque) & (rows.readings.load == 0)[:, None]
     q = rows.readings.position * complete.position_gain + complete.position_offset
     model = gravity_torque(gcomp_arm(done.arm), complete.beta, q)
-    left = np.where(counted, pair.invert(rows.readings.torque) - model, np.nan)
-    total = np.where(counted, left, 0.0)
-    rms: Array = np.sqrt((total**2).sum(axis=0) / np.maximum(counted.sum(axis=0), 1))
-    return np.where(counted.any(axis=0), rms, np.nan)
+    return rms(np.where(counted, pair.invert(rows.readings.torque) - model, np.nan))
 
 
 def _sweeps(done: Calibrated, fit: SensorFit) -> list[ReportSection]:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from calib.fit.calibration import rms
 from calib.fit.creep_fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
 from calib.report.page import COLOURS
@@ -99,11 +100,10 @@ def before_after_figure(names: tuple[str, ...], before: Array, after: Array, lab
 
 def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
     """As the paper's Figure 6: torque (K, n) [N·m] over the number of the reading; NaN is left out."""
-    rms = [_rms(sensor[:, j] - model[:, j]) for j in range(len(names))]
-    columns = [np.isfinite(sensor[:, j] - model[:, j]) for j in range(len(names))]
+    error = sensor - model
     return _panels(
-        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(names, rms, strict=True)],
-        [(model[keep, j], sensor[keep, j]) for j, keep in enumerate(columns)],
+        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(names, rms(error), strict=True)],
+        [(model[keep, j], sensor[keep, j]) for j, keep in enumerate(np.isfinite(error.T))],
         "number of the reading",
     )
 
@@ -111,7 +111,7 @@ def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
 def verify_figure(check: Verification) -> Any:
     """The paper's Figure 6: torque over pose number, model solid, sensor dashed, one panel per joint."""
     return _panels(
-        [f"{name}, RMS {rms:.3f} N·m" for name, rms in zip(check.names, check.rms, strict=True)],
+        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(check.names, check.rms, strict=True)],
         [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],
         "pose number",
     )
@@ -133,8 +133,3 @@ def _panels(titles: list[str], pairs: list[tuple[Array, Array]], along: str) -> 
     return figure.update_layout(
         height=PANEL * rows + 120, legend={"orientation": "h", "y": above, "x": 0}, margin={"t": 80}
     )
-
-
-def _rms(values: Array) -> float:
-    kept = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(kept**2))) if len(kept) else float("nan")

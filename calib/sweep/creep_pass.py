@@ -8,7 +8,7 @@ from calib.dataset import StallLine
 from calib.motion.mover import Stalled
 from calib.motion.static_reading import StaticReading, bin_readings
 from calib.plan.collisions import check_creeps
-from calib.plan.creep_plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
+from calib.plan.creep_plan import RAMP, CreepingArm, check_creep_limits, creep_ends, creep_speed, plan_creep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array
@@ -25,10 +25,10 @@ class CreepPass(SweepPass):
     def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
         """That of the data set, else the one given, else a new one: every pass of an arm has the same creeps."""
         self._plan = plan = self.data.plan or given or plan_creep(self.arm, seed=seed)
-        self._ground = CreepGround.of(self.arm)
-        check_creep_limits(self._ground, self.arm, plan)
-        if self._ground.geometry is not None:
-            check_creeps(self.arm, self._ground.geometry, plan, self.mover.command.position)
+        self._creeping = CreepingArm(self.arm)
+        check_creep_limits(self._creeping, self.arm, plan)
+        if self._creeping.geometry is not None:
+            check_creeps(self.arm, self._creeping.geometry, plan, self.mover.command.position)
         if self.data.plan is None:
             self.keep(plan)
         self._home, self._contacts = np.array(plan.scout[0]), 0
@@ -62,7 +62,7 @@ class CreepPass(SweepPass):
         goal = np.array(sweep.rest)
         goal[joint] = low
         mover.hold_all()
-        if not self._ground.way(mover.command.position, goal):
+        if not self._creeping.is_clear(mover.command.position, goal):
             mover.travel(self._home, self._plan.travel_acceleration)
         mover.travel(goal, self._plan.travel_acceleration)
         self._pause()
@@ -95,7 +95,7 @@ class CreepPass(SweepPass):
         n = self.mover.link.n
         follow = np.full(n, np.inf)
         stiffness = getattr(self.mover.link.arm.require_link().joints[joint].settings, "kp", None)
-        follow[joint] = max(self._ground.section.creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
+        follow[joint] = max(self._creeping.section.creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
         return ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), follow)
 
     def _pause(self) -> None:

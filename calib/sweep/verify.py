@@ -17,12 +17,12 @@ from armlink.link.types import Sample
 from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
-from calib.arm.sweep_section import SweepSection, sweep_motion, sweep_section
+from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
-from calib.plan.creep_plan import CreepGround
-from calib.plan.sweep_options import drawn_poses, nearest_first
+from calib.plan.creep_plan import CreepingArm
+from calib.plan.planned_arm import PlannedArm, nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
@@ -121,9 +121,9 @@ def run_verify(
     mover.hold_all()
     read_at: ReadAt = _half_sum_at if creeping else _rest_at
     if at is None and creeping:
-        at = partial(_creep_poses, CreepGround.of(arm_file), poses, seed)
+        at = partial(_creep_poses, CreepingArm(arm_file), poses, seed)
     elif at is None:
-        at = partial(verify_poses, limits, section, poses, seed)
+        at = partial(verify_poses, arm_file, poses, seed)
     held_out = at(mover.position)
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
@@ -192,24 +192,24 @@ def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
     return rest.position, rest.torque
 
 
-def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
+def verify_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
     """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
-    return nearest_first(drawn_poses(section, limits, count, np.random.default_rng([seed, 6])), begin)
+    return nearest_first(PlannedArm(arm_file).drawn_poses(count, np.random.default_rng([seed, 6])), begin)
 
 
-def _creep_poses(ground: CreepGround, count: int, seed: int, begin: Array) -> Array:
+def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> Array:
     """Random poses (P, n) [rad] about which nothing touches, each reached straight from the one before."""
     random = np.random.default_rng([seed, 6])
-    lower, upper = ground.ends
+    lower, upper = creeping.ends
     here, found = begin, list[Array]()
     for _ in range(200 * count):
         pose: Array = random.uniform(lower + CREEP_WAY / 2, upper - CREEP_WAY / 2)
-        if ground.way(pose - CREEP_WAY / 2, pose + CREEP_WAY / 2) and ground.way(here, pose):
+        if creeping.is_clear(pose - CREEP_WAY / 2, pose + CREEP_WAY / 2) and creeping.is_clear(here, pose):
             found.append(pose)
             here = pose
             if len(found) == count:
                 break
-    if ground.geometry is None and found:
+    if creeping.geometry is None and found:
         return nearest_first(np.array(found), begin)
     return np.array(found)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from same_thread import Immediate
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.can_bus import CanBus
@@ -56,15 +57,6 @@ def good_records(arm: ArmFile, truth: Truth) -> tuple[CalibrationRecord, Gravity
         gravity=arm.kinematics.gravity,
     )
     return CalibrationRecord(**provenance(arm, created=START), joints=joints), gravity
-
-
-def run_now(work: Callable[[], Any], done: Callable[[Any], None]) -> None:
-    """A job at once, in this thread."""
-    try:
-        outcome: Any = work()
-    except Exception as error:
-        outcome = error
-    done(outcome)
 
 
 class InlineLoop:
@@ -137,7 +129,7 @@ class DaemonBench:
     def start(self) -> None:
         """A service as the command starts it, on what the directory holds."""
         self.host = InlineLoop(self.arm, self._open)
-        environment = Environment(self.now, self.wall, run_now, self.host)
+        environment = Environment(self.now, self.wall, Immediate(), self.host, Immediate())
         settings = self.settings.model_copy(update={"work": self.work})
         self.service = Service(self.arm, settings, False, self.directory / "state", self.store, environment)
         self.view = ServiceView(self.service)

@@ -1,7 +1,5 @@
 """Settings of the cause test, and a payload added to readings."""
 
-from dataclasses import replace
-
 from calib.observer.config import ObserverConfig
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
@@ -9,7 +7,7 @@ from gcomp.gravity.torque import gravity_regressor
 SIGMA = 0.05
 
 
-CONFIG = replace(ObserverConfig(), position_std=0.0)
+CONFIG = ObserverConfig(position_std=0.0)
 
 
 def payload(mass):

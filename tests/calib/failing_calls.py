@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 from fast_daemon import FastDaemon
+from same_thread import Immediate
 
 from armlink.channel import Channel, Closed
 from armlink.errors import BusFault
@@ -27,7 +28,6 @@ from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
 from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon import main_loop
-from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import Daemon
 from calib.daemon.settings import DaemonSection, Options
 from calib.daemon.state.events import EventLog
@@ -196,7 +196,9 @@ class FailingDaemon(FastDaemon):
 
     def start(self, up: bool = True) -> None:
         self._surround()
-        options = Options(arm="sarcos", policy="apply", store=str(self.directory / "records.db"))
+        options = Options(
+            "sarcos", self.directory / "api.sock", policy="apply", store=str(self.directory / "records.db")
+        )
         settings = self.settings
         self._patch.setattr(Options, "settings", lambda *_: settings)
         self.daemon = Daemon(options, self.arm, BusProcess(self), self.directory / "state")
@@ -216,8 +218,7 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
-        notifier = main_loop.Notifier
-        patch.setattr(main_loop, "Notifier", lambda: notifier("systemd"))
+        patch.setenv("NOTIFY_SOCKET", "systemd")
         kinds = {name: getattr(socket, name) for name in ("AF_UNIX", "SOCK_DGRAM", "SOCK_NONBLOCK")}
         patch.setattr(
             main_loop, "socket", SimpleNamespace(socket=lambda *_: NotifySocket(self.failing, self.heard), **kinds)

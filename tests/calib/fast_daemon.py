@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from daemon_bench import run_now
 from fast_arm import PERIOD, FastArm
+from same_thread import Immediate
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
 from armlink.link.types import Calibration, Controller, DriveSerial, Stats
 from armlink.loop.messages import Batch, Progress, Up
-from calib.daemon.environment import Environment, Immediate
+from calib.daemon.environment import Environment
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
@@ -82,7 +82,7 @@ class FastDaemon:
         self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
         self.drives = [f"1:1:{k}" for k in range(self.fast.n)]
         self.sdo: list[str] = []
-        self.run_aside = run_now
+        self.run_aside = Immediate()
         self.disk = HeldDisk()
         self.on_write: Callable[[int], None] = lambda joint: None
         self.touring, self.job_after = 0, self.fast.job

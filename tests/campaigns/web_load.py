@@ -198,7 +198,8 @@ def month_of_history(folder: Path) -> None:
     """What a daemon has after 30 days: long answers for those that do not read."""
     values = [1.0] * len(load_arm("sarcos").joint_names)
     estimate = dict.fromkeys(("gain", "gain_std", "offset", "offset_std"), values)
-    journal, now = Journal(folder / "journal.db"), datetime.now(UTC)
+    journal = Journal(folder / "journal.db", time.monotonic, lambda work, done: done(work()))
+    now = datetime.now(UTC)
     with journal.transaction():
         for minute in range(DAYS * 1440):
             journal.add_history(now - timedelta(minutes=DAYS * 1440 - minute), 60.0 * minute, None, estimate)

@@ -18,8 +18,8 @@ from fuzz_kinds import KINDS, path_to_give
 from fuzzing import command_too_much, take_in
 from served_page import served
 
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.web import connection
-from calib.daemon.web.guard import RateLimit
 
 CORPUS = Path(__file__).parent / "corpus"
 FILES = [folder for kind in KINDS for folder in sorted(CORPUS.glob(f"{kind}/*"))]

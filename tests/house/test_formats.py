@@ -1,7 +1,6 @@
 """docs/formats.md holds to the code: keys with type, range, unit and default, channels, effects, records."""
 
 import ast
-import dataclasses
 import inspect
 import itertools
 import json
@@ -26,8 +25,6 @@ from tests.house.conftest import keyed, part, rows
 
 NOTHING = "–"
 SECTIONS = {point.name: point.load() for point in entry_points(group="armlink.sections")}
-OBSERVER = SECTIONS["daemon"]().observer_config()
-"""The observer's thresholds: a dataclass whose fields are the keys of daemon.observer."""
 
 
 # ---- models of pydantic
@@ -99,14 +96,11 @@ def keys_of(schema: dict, at: str = "", all_of: dict | None = None, seen: set[st
 
 
 def arm_file_keys() -> dict[str, tuple[str, str, str]]:
-    """Every key of the arm file, those of the packages' sections and of the observer's thresholds included."""
+    """Every key of the arm file, those of the packages' sections included."""
     found = keys_of(ArmFile.model_json_schema())
     del found["path"]  # where the file lies: no key of it
     for name, model in SECTIONS.items():
         found |= keys_of(model.model_json_schema(), f"{name}.")
-    for field in dataclasses.fields(OBSERVER):
-        kind = {"int": "integer", "float": "number"}[getattr(field.type, "__name__", field.type)]
-        found[f"daemon.observer.{field.name}"] = (kind, NOTHING, coded(field.default))
     return found
 
 
@@ -145,7 +139,7 @@ def test_every_key_of_the_arm_file_with_type_range_and_default():
     compare(keyed("1"), arm_file_keys())
 
 
-@pytest.mark.parametrize("model", [*(m for s in (ArmFile, *SECTIONS.values()) for m in models_in(s)), type(OBSERVER)])
+@pytest.mark.parametrize("model", [m for s in (ArmFile, *SECTIONS.values()) for m in models_in(s)])
 def test_units_of_the_arm_file(model):
     for name, units in units_in_docstrings(model).items():
         given = {row["unit"] for key, row in keyed("1").items() if key.rpartition(".")[2] == name}

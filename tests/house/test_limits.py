@@ -55,7 +55,7 @@ def test_the_numbers_of_all_sections_are_found() -> None:
     assert all(
         any(name.startswith(f"{kind.__name__}.") for name in NUMBERS) for kind in KNOWN if kind is not SimSection
     )
-    assert {"LinkJoint.max_velocity", "LinkJoint.max_torque_rate", "DaemonSection.observer"} <= set(NUMBERS)
+    assert {"LinkJoint.max_velocity", "LinkJoint.max_torque_rate", "ObserverConfig.still_band"} <= set(NUMBERS)
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])

@@ -99,12 +99,15 @@ def test_by_the_daemon(folder: Path) -> None:
         def say(self, *event: Any) -> None:
             said.append(event)
 
+    def at_once(work: Any, done: Any) -> None:
+        done(work())
+
     now = [START + timedelta(days=14)]
     settings = DaemonSection(diagnosis=DiagnosisSettings(sim=str(folder.parent / "sim.xml")))
     events, nothing = Events(), None
     daily = DailyDiagnosis(
         Configuration(load_arm("sarcos"), settings, listen_only=True),
-        Environment(lambda: (now[0] - START).total_seconds(), lambda: now[0], nothing, nothing),  # type: ignore[arg-type]
+        Environment(lambda: (now[0] - START).total_seconds(), lambda: now[0], at_once, nothing, at_once),  # type: ignore[arg-type]
         events,  # type: ignore[arg-type]
         WornMinute(),  # type: ignore[arg-type]
         folder,

@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -17,24 +16,18 @@ from calib.observer.evidence import DRIFT
 Item = JointsItem | ContactItem | EventItem
 
 
-class Client:
-    """One client's items; used on the event loop's thread only."""
+class Client(asyncio.Queue[Item]):
+    """One client's items: those of five seconds of joints; used on the event loop's thread only."""
 
     def __init__(self, hub: "Hub") -> None:
+        super().__init__(maxsize=50)
         self._hub = hub
-        self._items: deque[Item] = deque(maxlen=50)  # five seconds of joints
-        self._more = asyncio.Event()
 
-    def put(self, item: Item) -> None:
+    def add(self, item: Item) -> None:
         """Add an item; if the queue is full the oldest one is lost."""
-        self._items.append(item)
-        self._more.set()
-
-    async def get(self) -> Item:
-        while not self._items:
-            self._more.clear()
-            await self._more.wait()
-        return self._items.popleft()
+        if self.full():
+            self.get_nowait()
+        self.put_nowait(item)
 
     def close(self) -> None:
         self._hub.clients.discard(self)
@@ -51,7 +44,7 @@ class Hub:
 
     def publish(self, item: Item) -> None:
         for client in self.clients:
-            client.put(item)
+            client.add(item)
 
 
 CLOCK_JUMP = 2.0

@@ -11,7 +11,6 @@ shows in `trouble`.
 import json
 import logging
 import sqlite3
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,8 +21,8 @@ from typing import Any, TypeVar, cast
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
-from calib.daemon.environment import RETRY_SECONDS, Immediate, RunAside
-from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of
+from calib.daemon.environment import RETRY_SECONDS, RunAside
+from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of, utc_text
 from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
 
@@ -94,14 +93,12 @@ class Transaction:
 class Journal:
     """One process writes it; any other may read it. `_db` is for the thread that `run` gives work to."""
 
-    def __init__(
-        self, path: Path, monotonic: Callable[[], float] = time.monotonic, run: RunAside | None = None
-    ) -> None:
+    def __init__(self, path: Path, monotonic: Callable[[], float], run: RunAside) -> None:
         """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s].
 
         One that is damaged is set aside, under another name, and a new one is begun.
         """
-        self.path, self._monotonic, self._run = path, monotonic, run or Immediate()
+        self.path, self._monotonic, self._run = path, monotonic, run
         self._reader = HistoryReader(path)
         self._failed_at, self._asked_at = -float("inf"), float("inf")
         self._took = 0.0
@@ -398,7 +395,7 @@ class Journal:
         number, self._next_event = self._next_event, self._next_event + 1
         statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
-            self._write(statement, number, _iso(time), t, kind, joint, text, json.dumps(evidence))
+            self._write(statement, number, utc_text(time), t, kind, joint, text, json.dumps(evidence))
             self.once_kept(lambda: setattr(self, "_last_event", max(self._last_event, number)))
         return number
 
@@ -435,7 +432,7 @@ class Journal:
         """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
         number, self._next_proposal = self._next_proposal, self._next_proposal + 1
         statement = "INSERT INTO proposals(id, time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?, ?)"
-        values = _iso(time), joint, record, base, json.dumps(finding.as_json())
+        values = utc_text(time), joint, record, base, json.dumps(finding.as_json())
         with self.transaction():
             for earlier in self.proposals():
                 if earlier.proposal.joint == joint and earlier.proposal.state == "pending":
@@ -449,7 +446,7 @@ class Journal:
             "INSERT INTO decisions(proposal, time, state, by, note) SELECT ?, ?, ?, ?, ? "
             "WHERE EXISTS (SELECT 1 FROM proposals WHERE id = ?)"
         )
-        self._write(statement, proposal, _iso(time), state, by, note, proposal, proposal=proposal)
+        self._write(statement, proposal, utc_text(time), state, by, note, proposal, proposal=proposal)
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
         return list(self._rows.values())[:limit]
@@ -470,7 +467,7 @@ class Journal:
         self._belief = calibration, gravity, json.dumps(state)
         for waits in list(self._queue)[self._asked :]:  # this one takes their place
             waits.statements = [each for each in waits.statements if each[0] is not _BELIEF]
-        self._write(_BELIEF, _iso(time), *self._belief)
+        self._write(_BELIEF, utc_text(time), *self._belief)
 
     def belief(self) -> SavedBelief | None:
         """The observer's saved state; None if there is none or it cannot be read."""
@@ -482,11 +479,11 @@ class Journal:
 
     def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
         statement = "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)"
-        self._write(statement, _iso(time), t, record, json.dumps(estimate))
+        self._write(statement, utc_text(time), t, record, json.dumps(estimate))
 
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
-        self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", _iso(before), keep_every)
+        self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", utc_text(before), keep_every)
 
 
 def _made(take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]]) -> list[R]:
@@ -511,8 +508,3 @@ def _event(row: tuple[Any, ...]) -> EventRecord:
 def _aged(row: tuple[Any, ...]) -> tuple[float, str | None, dict[str, Any] | None]:
     t, joint, evidence = row
     return float(t), joint, None if evidence is None else dict(json.loads(evidence))
-
-
-def _iso(time: datetime) -> str:
-    """UTC with microseconds: sorts as text."""
-    return time.astimezone(UTC).isoformat(timespec="microseconds")

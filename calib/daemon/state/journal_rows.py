@@ -77,7 +77,7 @@ class HistoryReader:
 
     def chosen(self, since: datetime | None, until: datetime | None, most: int) -> list[int]:
         """Ids of a time span's rows, oldest first, thinned evenly to at most `most`; always includes the newest."""
-        span = (_iso(since) if since else "", _iso(until) if until else "9999")
+        span = (utc_text(since) if since else "", utc_text(until) if until else "9999")
         found = self._rows("SELECT id FROM history WHERE time >= ? AND time <= ? ORDER BY id DESC", span)
         step = max(1, -(-len(found) // max(most, 1)))
         return [number for (number,) in found[::step]][::-1]
@@ -108,5 +108,6 @@ def _row(found: tuple[Any, ...]) -> HistoryRow | None:
         return None
 
 
-def _iso(time: datetime) -> str:
+def utc_text(time: datetime) -> str:
+    """UTC with microseconds: sorts as text."""
     return time.astimezone(UTC).isoformat(timespec="microseconds")

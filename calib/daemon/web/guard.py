@@ -7,7 +7,6 @@ import math
 import re
 import socket
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,35 +16,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
+from calib.daemon.rate_limit import Rate, RateLimit
 from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of, until_gone
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Size of a bucket, and the tokens it gains per second."""
-
-    burst: float
-    per_second: float
-
-
-class RateLimit:
-    """`take(key, now)` returns how long to wait [s]: 0 if a request may proceed."""
-
-    def __init__(self, rate: Rate, keys: int = 1000) -> None:
-        """Remembers the `keys` addresses seen last."""
-        self.rate, self._keys = rate, keys
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def take(self, key: str, now: float, cost: float = 1.0) -> float:
-        """Take `cost` tokens of the key's bucket at `now` [s], monotonic; returns the wait for enough [s]."""
-        left, since = self._buckets.pop(key, (self.rate.burst, now))
-        left = min(self.rate.burst, left + (now - since) * self.rate.per_second)
-        wait = max(0.0, (1.0 - left) / self.rate.per_second)
-        self._buckets[key] = (left if wait else left - cost, now)
-        while len(self._buckets) > self._keys:
-            self._buckets.popitem(last=False)
-        return wait
-
 
 BODY_LIMIT = 4096
 """Largest body [bytes]; the only bodies are names."""

@@ -31,20 +31,15 @@ FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
 
 
-async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] | None, token: str | None) -> None:
+async def serve(view: DaemonView, *, socket: Path, tcp: tuple[str, int] | None, token: str | None) -> None:
     """Serve until cancelled, then remove the socket file. Raises BadInput if it cannot listen.
 
     The Unix socket has mode 0660, so that the file system controls access; TCP needs a token of at least 16 characters.
     """
     if tcp is not None and (token is None or len(token) < SHORTEST_TOKEN):
         raise BadInput(f"--tcp needs --token-file with a token of at least {SHORTEST_TOKEN} characters")
-    if socket is None and tcp is None:
-        raise BadInput("give a Unix socket or a TCP address to serve on")
     with contextlib.ExitStack() as opened:
-        listening, places = [], []
-        if socket is not None:
-            listening.append(opened.enter_context(unix_socket(socket)))
-            places.append(f"socket {socket}")
+        listening, places = [opened.enter_context(unix_socket(socket))], [f"socket {socket}"]
         if tcp is not None:
             listening.append(opened.enter_context(tcp_socket(*tcp)))
             places.append(f"http://{f'[{tcp[0]}]' if ':' in tcp[0] else tcp[0]}:{tcp[1]}/ (with the token)")

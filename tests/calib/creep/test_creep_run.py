@@ -13,7 +13,7 @@ from armlink.link.link import Link
 from calib.arm.sweep_section import sweep_motion
 from calib.dataset import load_data
 from calib.fit.creep_fit import fit_creep
-from calib.plan.creep_plan import CreepGround, check_creep_limits, plan_creep
+from calib.plan.creep_plan import CreepingArm, check_creep_limits, plan_creep
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
 from calib.sweep.weigh import run_weigh
@@ -110,7 +110,7 @@ def test_a_plan_that_was_edited_is_refused(what: str) -> None:
     plan = plan_creep(arm())
     changed, said = EDITED[what]
     sweeps = tuple(each.model_copy(update=changed) if each.joint == 1 else each for each in plan.sweeps)
-    ground = CreepGround.of(arm())
+    ground = CreepingArm(arm())
     check_creep_limits(ground, arm(), plan)
     with pytest.raises(Refused) as caught:
         check_creep_limits(ground, arm(), plan.model_copy(update={"sweeps": sweeps}))

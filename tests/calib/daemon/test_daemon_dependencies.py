@@ -12,6 +12,7 @@ from failing_calls import DEPENDENCIES, OtherCommit, events, watched_drift
 from fast_daemon import FastDaemon, drifted, metric, settings
 from made_records import activate_by_hand, copied
 from postgres import NoServer, stoppable_server
+from same_thread import journal_at
 
 from armlink.errors import BadInput, BusFault
 from calib.daemon.state.journal import Journal
@@ -173,7 +174,7 @@ def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monk
     with pytest.raises(
         BadInput, match=r"journal.db: the journal cannot be opened: attempt to write a readonly database"
     ):
-        Journal(path)
+        journal_at(path)
 
 
 class NoCommit(OtherCommit):
@@ -184,7 +185,7 @@ class NoCommit(OtherCommit):
 
 
 def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    journal = journal_at(tmp_path / "journal.db", lambda: 0.0)
     real = journal._db
 
     journal._db = NoCommit(real)  # type: ignore[assignment]
@@ -309,10 +310,10 @@ def test_a_damaged_belief_is_none(tmp_path: Path, state: str) -> None:
 
 
 def test_a_schema_that_sqlite_cannot_quote_is_damage(tmp_path: Path) -> None:
-    Journal(tmp_path / "journal.db", lambda: 0.0).close()
+    journal_at(tmp_path / "journal.db", lambda: 0.0).close()
     content = (tmp_path / "journal.db").read_bytes()
     (tmp_path / "journal.db").write_bytes(content.replace(b"CREATE TABLE events", b"CREATE \xd2\xff\xfeLE events"))
-    assert Journal(tmp_path / "journal.db", lambda: 0.0).set_aside.startswith("journal.db.damaged-")
+    assert journal_at(tmp_path / "journal.db", lambda: 0.0).set_aside.startswith("journal.db.damaged-")
 
 
 def spoiled(journal: Path, statement: str) -> None:
@@ -325,7 +326,7 @@ def spoiled(journal: Path, statement: str) -> None:
 
 def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:
     (tmp_path / "journal.db").write_bytes(b"no database at all" * 1000)
-    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    journal = journal_at(tmp_path / "journal.db", lambda: 0.0)
     assert journal.set_aside.startswith("journal.db.damaged-")
     assert journal.events() == []
 
@@ -398,11 +399,11 @@ def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path:
     assert daemon.view.proposals()[0].state == "approved"
     assert "disk is full" in daemon.view.status().detail
     kind = {"failed": "fault", "applied": "recalibration"}[state]
-    assert kind not in [item.event.kind for item in streamed._items if isinstance(item, EventItem)]
+    assert kind not in [item.event.kind for item in streamed._queue if isinstance(item, EventItem)]
     daemon.run(3)
     assert daemon.view.proposals()[0].state == state
     assert len(daemon.of_kind(kind)) == 1
-    assert [item.event.kind for item in streamed._items if isinstance(item, EventItem)].count(kind) == 1
+    assert [item.event.kind for item in streamed._queue if isinstance(item, EventItem)].count(kind) == 1
     assert daemon.view.status().detail == ""
     current = daemon.store.current(CalibrationRecord, daemon.arm)
     assert current is not None

@@ -311,7 +311,7 @@ def test_the_bus_process_logs_as_the_daemon_does(tmp_path: Path) -> None:
     """Its warnings are lines of JSON too, for systemd's journal."""
     program = (
         "import sys; from armlink.arm_file import load_arm; from calib.daemon.settings import Options\n"
-        "host = Options('openarm', bus=sys.argv[1], listen_only=True).keep(load_arm('openarm'))\n"
+        "host = Options('openarm', 'api.sock', bus=sys.argv[1], listen_only=True).keep(load_arm('openarm'))\n"
         "while not any(type(each).__name__ == 'Up' for each in host.pump()): host._channel.wait(60.0)\n"
         "host.close()"
     )

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_bench import run_now
 from fast_daemon import FastDaemon, settings
+from same_thread import Immediate, journal_at
 
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
@@ -20,10 +20,11 @@ from armlink.loop.messages import Down, Up
 from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter, LineLimit
 from calib.daemon.main_loop import Notifier, watchdog_seconds
+from calib.daemon.rate_limit import Rate
 from calib.daemon.settings import DaemonSection
-from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import HistoryPoint, NoSuch, NotPossible, State
+from calib.observer.config import ObserverConfig
 from calib.observer.recalibrator import Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
@@ -290,7 +291,7 @@ def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None
     proposal = daemon.view.proposals()[0]
     daemon.service.journal.decide(daemon.service.journal.proposals()[0].id, daemon.wall(), "approved", "ann")
     daemon.service.save()
-    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store, "propose")
+    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store)
     recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
     rows = daemon.view.status().rows
     daemon.kill()
@@ -324,8 +325,8 @@ def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Pat
     daemon.service.tick()
     assert not daemon.of_kind("configuration")
     (write,) = jobs
-    run_now(*write)
-    daemon.run_aside = run_now
+    Immediate()(*write)
+    daemon.run_aside = Immediate()
     daemon.service.tick()
     assert daemon.of_kind("configuration")[0].evidence["joints"] == ["joint_6"]
 
@@ -495,11 +496,11 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
 
 
 def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db")
+    journal = journal_at(tmp_path / "journal.db")
     journal._db.execute("PRAGMA user_version=99")
     journal.close()
     with pytest.raises(BadInput, match="schema 99"):
-        Journal(tmp_path / "journal.db")
+        journal_at(tmp_path / "journal.db")
 
 
 def keep_history(daemon: FastDaemon) -> None:
@@ -558,7 +559,7 @@ def test_recordings_are_rotated_within_their_quota_and_load(tmp_path: Path) -> N
 
 
 def test_unknown_keys_and_thresholds_of_the_section_are_refused() -> None:
-    with pytest.raises(ValueError, match="no threshold 'windw'"):
+    with pytest.raises(ValueError, match=r"observer\.windw"):
         DaemonSection.model_validate({"observer": {"windw": 3}})
     with pytest.raises(ValueError, match="polcy"):
         DaemonSection.model_validate({"polcy": "apply"})
@@ -569,9 +570,10 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(path))
-        Notifier(str(path))("READY=1", "STATUS=observing")
+        monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+        Notifier()("READY=1", "STATUS=observing")
         assert receiver.recv(100) == b"READY=1\nSTATUS=observing"
-    Notifier(str(path))("WATCHDOG=1")  # gone: no reason to stop
+    Notifier()("WATCHDOG=1")  # gone: no reason to stop
     monkeypatch.setenv("WATCHDOG_USEC", "30000000")
     monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
     assert watchdog_seconds() == 30.0
@@ -588,7 +590,7 @@ def test_a_log_line_is_one_json_object() -> None:
 
 
 def test_a_flood_of_log_lines_is_cut_and_counted() -> None:
-    limit, lines = LineLimit(burst=3, per_second=1), []
+    limit, lines = LineLimit(Rate(burst=3, per_second=1)), []
     for second in (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0):
         record = logging.makeLogRecord({"name": "uvicorn", "levelname": "WARNING", "msg": "again", "created": second})
         if limit.filter(record):
@@ -612,16 +614,16 @@ def test_a_slow_client_loses_the_oldest_and_holds_nobody_up(tmp_path: Path) -> N
         daemon.view.publish()
     last = daemon.view.snapshot()
     assert asyncio.run(_first(client)).type == "joints"
-    assert len(client._items) < 100
+    assert client.qsize() < 100
     client.close()
     daemon.view.publish()
-    assert len(client._items) < 100
+    assert client.qsize() < 100
     assert last.joints[0].joint == "joint_1"
 
 
 def test_thresholds_of_earlier_arm_files_are_left_out_and_said_so(caplog: pytest.LogCaptureFixture) -> None:
     given = {"place_size": 0.3, "excitation_rows": 40, "window": 16}
-    assert settings("apply", observer=given).observer == {"window": 16}
+    assert settings("apply", observer=given).observer == ObserverConfig(window=16)
     assert [record.args for record in caplog.records] == [("excitation_rows",), ("place_size",)]
-    with pytest.raises(ValueError, match="no threshold 'windows'"):
+    with pytest.raises(ValueError, match=r"observer\.windows"):
         settings("apply", observer={"windows": 16})

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fast_daemon import FastDaemon
+from same_thread import Immediate
 
 from armlink.arm_file import load_arm
 from armlink.link.types import Stats
@@ -35,7 +36,7 @@ class Bench:
         nothing: Any = None
         begun, self.set_by = self.time, timedelta()
         environment = Environment(
-            lambda: (self.time - begun).total_seconds(), lambda: self.time + self.set_by, nothing, nothing
+            lambda: (self.time - begun).total_seconds(), lambda: self.time + self.set_by, nothing, nothing, Immediate()
         )
         self.busiest, self.joints, self.now = BusiestMinute(250.0), len(configuration.names), 0.0
         self.daily = DailyDiagnosis(configuration, environment, self, self.busiest, directory)  # type: ignore[arg-type]

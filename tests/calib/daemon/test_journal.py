@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from same_thread import journal_at
 
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import HistoryReader
@@ -16,7 +17,7 @@ NOW = datetime(2026, 5, 1, tzinfo=UTC)
 
 @pytest.fixture
 def journal(tmp_path: Path) -> Journal:
-    return Journal(tmp_path / "journal.db")
+    return journal_at(tmp_path / "journal.db")
 
 
 def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal: Journal) -> None:
@@ -65,18 +66,18 @@ def test_a_history_is_thinned_evenly_to_what_is_asked_for_and_keeps_the_newest(
 
 
 def test_ids_that_leave_no_room_for_more_are_damage(tmp_path: Path) -> None:
-    first = Journal(tmp_path / "journal.db")
+    first = journal_at(tmp_path / "journal.db")
     first._db.execute(
         "INSERT INTO events(id, time, t, kind, text, evidence) VALUES (?, '', 0, '', '', '{}')", (2**63 - 1,)
     )
     first.close()
-    second = Journal(tmp_path / "journal.db")
+    second = journal_at(tmp_path / "journal.db")
     assert second.set_aside.startswith("journal.db.damaged-")
     assert second.add_event(NOW, 0.0, "clock", None, "", {}) == 1
 
 
 def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    journal = journal_at(tmp_path / "journal.db", lambda: 0.0)
     finding = DriftFinding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
     assert [journal.add_proposal(NOW, "j1", "0a", "0b", finding) for _ in range(2)] == [1, 2]
     journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
@@ -85,7 +86,7 @@ def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_p
     journal.decide(2, NOW, "approved", "ann")
     assert journal.add_proposal(NOW, "j1", "0a", "0b", finding) == 3
     journal.close()
-    assert [row.proposal.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]
+    assert [row.proposal.state for row in journal_at(tmp_path / "journal.db").proposals()] == ["pending"]
 
 
 @pytest.mark.parametrize("how", ["moved", "another", "older copy", "no journal"])
@@ -95,10 +96,10 @@ def test_a_journal_whose_name_another_file_has_taken_goes_on_in_that_one(tmp_pat
     def keep(text: str) -> int:
         return journal.add_event(NOW, now[0], "clock", None, text, {})
 
-    journal = Journal(path, lambda: now[0])
+    journal = journal_at(path, lambda: now[0])
     keep("of before")
     if how == "another":
-        Journal(tmp_path / "taken.db").close()
+        journal_at(tmp_path / "taken.db").close()
     if how == "older copy":
         with sqlite3.connect(path) as source, sqlite3.connect(tmp_path / "taken.db") as copy:
             source.backup(copy)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from same_thread import Immediate
 
 from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm
@@ -18,7 +19,6 @@ from armlink.link.types import Tell
 from armlink.loop.kept_arm import KeptMessage
 from armlink.loop.messages import Told
 from calib.daemon import main_loop
-from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon, Notifier
 from calib.daemon.settings import Options
 from calib.records.file_lock import locked_directory
@@ -57,7 +57,7 @@ class Running:
         self.started: list[NoProcess] = []
         patch.setattr(Options, "keep", lambda options, arm: self._start(arm))
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
-        options = Options(arm=str(self.arm_file), store=str(folder / "records.db"))
+        options = Options(arm=str(self.arm_file), socket=folder / "api.sock", store=str(folder / "records.db"))
         self.process = NoProcess()
         self.daemon = Daemon(options, load_arm(self.arm_file), self.process, folder / "state")  # type: ignore[arg-type]
 
@@ -185,9 +185,12 @@ def test_systemd_is_told_of_the_end_of_a_reload_whatever_happens(
         assert receiver.recv(200) == b"READY=1"
 
 
-def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(tmp_path: Path) -> None:
+def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "notify"
-    notify = Notifier(str(path))
+    monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+    notify = Notifier()
     for line in (
         "READY=1",
         "STATUS=starting",

@@ -56,7 +56,7 @@ def waiting(daemon: FastDaemon) -> int:
 
 def test_the_event_loop_turns_and_answers_while_the_disk_does_not(tmp_path: Path) -> None:
     async def main() -> None:
-        options = Options(arm="sarcos", store=str(tmp_path / "records.db"))
+        options = Options(arm="sarcos", socket=tmp_path / "api.sock", store=str(tmp_path / "records.db"))
         daemon = Daemon(options, load_arm("sarcos"), NoProcess(), tmp_path / "state")  # type: ignore[arg-type]
         journal = daemon.service.journal
         slow: Any = SlowCommit(journal._db)
@@ -92,10 +92,10 @@ def test_a_disk_that_does_not_answer_shows_and_keeps_all_events_in_order(tmp_pat
     assert status.state is State.OBSERVING
     assert status.rows > rows
     assert not daemon.of_kind("clock")
-    assert not [item for item in streamed._items if isinstance(item, EventItem)]
+    assert not [item for item in streamed._queue if isinstance(item, EventItem)]
     daemon.disk.release()
     assert [event.text for event in daemon.of_kind("clock")] == [f"number {number}" for number in range(20)]
-    told = [item.event for item in streamed._items if isinstance(item, EventItem)]
+    told = [item.event for item in streamed._queue if isinstance(item, EventItem)]
     assert [event.text for event in told] == [f"number {number}" for number in range(20)]
     assert [event.id for event in told] == [event.id for event in daemon.of_kind("clock")]
     daemon.run(3)

@@ -216,7 +216,7 @@ def test_a_joint_without_stops_floats_too() -> None:
 
 
 def test_the_float_passes_to_the_process_that_makes_the_cycles(control: FloatControl) -> None:
-    position = np.zeros(len(control.speed))
+    position = np.zeros(len(middle()))
     floating = pickle.loads(pickle.dumps(Floating(control, position)))
     sample = SimpleNamespace(position=position, t=0.0)
     np.testing.assert_array_equal(floating.command(sample).torque, Floating(control, position).command(sample).torque)

@@ -181,18 +181,18 @@ def _rollback(store: RecordStore, controllers: Controllers) -> None:
 
 
 def _recalibrate(store: RecordStore, controllers: Controllers) -> None:
-    Recalibrator(ARM, controllers, store, "apply").handle(FINDING)
+    Recalibrator(ARM, controllers, store).recalibrate(FINDING)
 
 
 def _undo(store: RecordStore, controllers: Controllers) -> None:
-    recalibrator = Recalibrator(ARM, controllers, store, "apply")
-    recalibrator.handle(FINDING)
+    recalibrator = Recalibrator(ARM, controllers, store)
+    recalibrator.recalibrate(FINDING)
     recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m"))
 
 
 def _restore(store: RecordStore, controllers: Controllers) -> None:
     store.put(record(joints=(joint("shoulder", 1.12), joint("elbow"))), ARM, by="ann", reason="imported")
-    Recalibrator(ARM, controllers, store, "propose").restore()
+    Recalibrator(ARM, controllers, store).restore()
 
 
 @pytest.mark.parametrize("way", [_install, _failed_check, _recover, _rollback, _recalibrate, _undo, _restore])

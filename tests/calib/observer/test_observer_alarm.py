@@ -66,7 +66,7 @@ def test_the_filter_tracks_to_the_accuracy_of_its_random_walk(sarcos, sarcos_bet
     """Steady state of docs/theory.md, section 6: std(o) about 0.007 N·m, std(k) 0.044 … 0.12 % on joints 1 to 6."""
     random = np.random.default_rng(2)
     torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (900, 7)))
-    tracked = SensorFilter(7, replace(CONFIG, gain_std=1.0))  # the figures are without the excitation gate
+    tracked = SensorFilter(7, ObserverConfig(gain_std=1.0))  # the figures are without the excitation gate
     errors = []
     for tau in torque:
         tracked.handle(1.003 * tau - 0.04 + SIGMA * random.normal(size=7), tau, np.full(7, SIGMA**2))

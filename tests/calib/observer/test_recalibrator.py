@@ -79,9 +79,7 @@ def test_a_joint_without_gain_follows_its_offset_only() -> None:
 
 def test_apply_writes_record_and_controller(store: RecordStore) -> None:
     controllers = Controllers()
-    done = Recalibrator(ARM, controllers, store, "apply").handle(finding())
-    assert done is not None
-    assert done.applied
+    done = Recalibrator(ARM, controllers, store).recalibrate(finding())
     assert store.current(CalibrationRecord, ARM) == done.record
     assert controllers.held[1].gain == pytest.approx(1.1 * 1.03, rel=1e-7)
     assert controllers.held[1].offset == pytest.approx(-0.4 + 0.33, rel=1e-6)
@@ -92,8 +90,8 @@ def test_apply_writes_record_and_controller(store: RecordStore) -> None:
 def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
     """The old pair is back in the controller, the old record current, and the change is told as a finding."""
     controllers = Controllers()
-    recalibrator = Recalibrator(ARM, controllers, store, "apply")
-    recalibrator.handle(finding(1.03, 0.3))
+    recalibrator = Recalibrator(ARM, controllers, store)
+    recalibrator.recalibrate(finding(1.03, 0.3))
     outcome = recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m, 0.2 with the old gain"))
     assert outcome.record == recalibrator.record == store.current(CalibrationRecord, ARM) == record()
     assert (controllers.held[1].gain, controllers.held[1].record_id) == (pytest.approx(1.1), record().number)
@@ -140,7 +138,7 @@ def test_whichever_call_fails_it_and_the_store_agree_on_what_is_in_force(tmp_pat
         number += 1
         shutil.copy(tmp_path / "begun.db", tmp_path / f"{number}.db")
         store, controllers = RecordStore(str(tmp_path / f"{number}.db")), Controllers()
-        recalibrator = Recalibrator(ARM, controllers, store, "propose")
+        recalibrator = Recalibrator(ARM, controllers, store)
         proposed = recalibrator.propose(finding())
         if step == "undo":
             recalibrator.apply(proposed.record, 1, "ann")
@@ -169,27 +167,18 @@ def test_whichever_call_fails_it_and_the_store_agree_on_what_is_in_force(tmp_pat
 
 def test_propose_keeps_the_record_and_touches_nothing(store: RecordStore) -> None:
     controllers = Controllers()
-    done = Recalibrator(ARM, controllers, store, "propose").handle(finding())
-    assert done is not None
-    assert not done.applied
+    done = Recalibrator(ARM, controllers, store).propose(finding())
     assert done.record.confirmed_by is None
     assert done.record in store.history(ARM)
     assert store.current(CalibrationRecord, ARM) == record()
     assert controllers.held == Controllers().held
 
 
-def test_observe_keeps_nothing(store: RecordStore) -> None:
-    assert Recalibrator(ARM, Controllers(), store, "observe").handle(finding()) is None
-    assert store.history(ARM) == [record()]
-
-
 def test_a_second_drift_is_relative_to_the_first_recalibration(store: RecordStore) -> None:
     controllers = Controllers()
-    recalibrator = Recalibrator(ARM, controllers, store, "apply")
-    first = recalibrator.handle(finding(1.03, 0.3))
-    second = recalibrator.handle(finding(1.01, -0.1))
-    assert first is not None
-    assert second is not None
+    recalibrator = Recalibrator(ARM, controllers, store)
+    first = recalibrator.recalibrate(finding(1.03, 0.3))
+    second = recalibrator.recalibrate(finding(1.01, -0.1))
     assert second.record.parent == first.record.id
     assert second.gain == pytest.approx(1.1 * 1.03 * 1.01)
     assert [line.record for line in store.activations(ARM)] == [record().id, first.record.id, second.record.id]
@@ -202,35 +191,35 @@ def test_a_second_drift_is_relative_to_the_first_recalibration(store: RecordStor
 def test_an_implausible_change_is_refused(store: RecordStore, change: DriftFinding, what: str) -> None:
     controllers = Controllers()
     with pytest.raises(Refused, match=what):
-        Recalibrator(ARM, controllers, store, "apply").handle(change)
+        Recalibrator(ARM, controllers, store).recalibrate(change)
     assert controllers.held == Controllers().held
     assert store.history(ARM) == [record()]
 
 
 def test_bounds_are_against_the_last_sweep_not_the_last_step(store: RecordStore) -> None:
-    recalibrator = Recalibrator(ARM, Controllers(), store, "apply")
-    recalibrator.handle(finding(1.06, 0.0))
-    again = Recalibrator(ARM, recalibrator._controllers, store, "apply")  # after a restart too
+    recalibrator = Recalibrator(ARM, Controllers(), store)
+    recalibrator.recalibrate(finding(1.06, 0.0))
+    again = Recalibrator(ARM, recalibrator._controllers, store)  # after a restart too
     with pytest.raises(Refused, match="a drift is at most 10%"):
-        again.handle(finding(1.06, 0.0))
+        again.recalibrate(finding(1.06, 0.0))
 
 
 def test_a_controller_that_holds_something_else_is_refused(store: RecordStore) -> None:
     with pytest.raises(Refused, match="elbow: the drive holds gain 1, but record"):
-        Recalibrator(ARM, Controllers(gain=1.0), store, "apply").handle(finding())
+        Recalibrator(ARM, Controllers(gain=1.0), store).recalibrate(finding())
 
 
 def test_a_failed_write_leaves_the_old_record_current(store: RecordStore) -> None:
     controllers = Controllers()
     controllers.broken = True
     with pytest.raises(BusFault):
-        Recalibrator(ARM, controllers, store, "apply").handle(finding())
+        Recalibrator(ARM, controllers, store).recalibrate(finding())
     assert store.current(CalibrationRecord, ARM) == record()
 
 
 def test_an_arm_without_a_record_is_refused(tmp_path: Path) -> None:
     with pytest.raises(Refused, match="no calibration record yet"):
-        Recalibrator(ARM, Controllers(), RecordStore(str(tmp_path / "records.db")), "apply")
+        Recalibrator(ARM, Controllers(), RecordStore(str(tmp_path / "records.db")))
 
 
 def test_restore_puts_a_whole_record_on_the_controllers(store: RecordStore) -> None:
@@ -239,7 +228,7 @@ def test_restore_puts_a_whole_record_on_the_controllers(store: RecordStore) -> N
     vertical = record(joints=(joint("shoulder", gain=None), joint("elbow")), covariance_of=(), covariance=())
     store.put(vertical, ARM, by="ann", reason="sweep")
     log = store.activations(ARM)
-    assert Recalibrator(ARM, controllers, store, "propose").restore() == NAMES
+    assert Recalibrator(ARM, controllers, store).restore() == NAMES
     assert store.activations(ARM) == log
     assert [line.stage for line in store.writes(ARM)] == ["begun", "finished"]
     assert [held.date for held in controllers.held] == [int(vertical.created.timestamp())] * 2

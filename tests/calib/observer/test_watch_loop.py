@@ -13,7 +13,7 @@ from armlink.link.types import Calibration, Command, DriveSerial, Sample
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.trajectory import WorkMotion, work_targets
 from calib.observer.config import ObserverConfig
-from calib.observer.observer import Observer
+from calib.observer.observer import observer_of
 from calib.observer.recalibrator import Recalibrator
 from calib.observer.watch_loop import WatchHistory, watch
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
@@ -115,7 +115,7 @@ class MadeUpLink:
 class Setup:
     """A made-up arm with its records in force, observed at quick work."""
 
-    def __init__(self, tmp_path: Path, policy: str) -> None:
+    def __init__(self, tmp_path: Path) -> None:
         arm = arm_file()
         truth = Truth.draw(arm, 3)
         self.link = MadeUpLink(arm, truth)
@@ -124,8 +124,8 @@ class Setup:
         self.store.put(self.record, arm, by="ann", reason="sweep")
         put_on(self.link, self.record)
         self.arm = arm
-        self.observer = Observer.of_records(self.link.arm, self.record, gravity, RATED, QUICK)
-        self.recalibrator = Recalibrator(arm, self.link, self.store, policy)  # type: ignore[arg-type]
+        self.observer = observer_of(self.link.arm, self.record, gravity, RATED, QUICK)
+        self.recalibrator: Recalibrator | None = Recalibrator(arm, self.link, self.store)  # type: ignore[arg-type]
 
     def watch(self, seconds: float) -> WatchHistory:
         arm, random = self.link.arm, np.random.default_rng(int(1000 * self.link.t))
@@ -138,7 +138,7 @@ class Setup:
 
 
 def test_apply_puts_a_drifted_sensor_right(tmp_path: Path) -> None:
-    setup = Setup(tmp_path, "apply")
+    setup = Setup(tmp_path)
     assert setup.watch(50).events == []
     setup.drift()
     history = setup.watch(90)
@@ -151,26 +151,26 @@ def test_apply_puts_a_drifted_sensor_right(tmp_path: Path) -> None:
     assert current is not None
     assert current.number == held.record_id
     assert len(history.t) == len(history.gain) == len(history.offset_std) > 30
-    alarm, written = history.first("alarm", "shoulder"), history.first("recalibration", "shoulder")
+    alarm, written = history.first("alarm"), history.first("recalibration")
     assert alarm is not None
     assert written is not None
     assert alarm < written == history.recalibrations[0][0]
 
 
 @pytest.mark.long
-def test_propose_and_observe_leave_the_controller_alone(tmp_path: Path) -> None:
-    for policy, kept in (("propose", 1), ("observe", 0)):
-        setup = Setup(tmp_path / policy, policy)
-        setup.watch(50)
-        setup.drift()
-        history = setup.watch(90)
-        assert [event for event in history.events if event.kind == "proposal"]
-        assert len(history.recalibrations) == kept
-        assert setup.link.held[1].record_id == setup.record.number
+def test_without_a_recalibrator_nothing_is_written(tmp_path: Path) -> None:
+    setup = Setup(tmp_path)
+    setup.recalibrator = None
+    setup.watch(50)
+    setup.drift()
+    history = setup.watch(90)
+    assert [event for event in history.events if event.kind == "proposal"]
+    assert history.recalibrations == []
+    assert setup.link.held[1].record_id == setup.record.number
 
 
 def test_a_refused_recalibration_is_an_event(tmp_path: Path) -> None:
-    setup = Setup(tmp_path, "apply")
+    setup = Setup(tmp_path)
     setup.watch(50)
     setup.link.gain[1] *= 1.2
     history = setup.watch(90)
@@ -206,8 +206,8 @@ def test_on_the_simulated_arm_a_drift_is_found_and_put_right(tmp_path: Path) -> 
         link.enable()
         put_on(link, record)
         described = gcomp_arm(arm)
-        observer = Observer.of_records(described, record, gravity, RATED, QUICK)
-        recalibrator = Recalibrator(arm, link, store, "apply")
+        observer = observer_of(described, record, gravity, RATED, QUICK)
+        recalibrator = Recalibrator(arm, link, store)
         random = np.random.default_rng(seed)
         limits = (described.lower, described.upper, np.ones(3), link.period, random)
         targets = work_targets(link.position_sent, *limits)

@@ -206,7 +206,7 @@ class MadeUpView:
 
     def subscribe(self) -> Client:
         client = self.hub.subscribe()
-        client.put(self.item())
+        client.add(self.item())
         return client
 
     def _decide(self, number: int, state: str, by: str, digest: str | None) -> Future[view.Proposal]:

@@ -42,7 +42,7 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> FastDaemon:
     )
     work = Recording(t=t, names=daemon.arm.joint_names, position=q, torque=torque)
     records = records_of(daemon)
-    listener = listener_of(records, [work], [], "torque")
+    listener = listener_of(records, [work], [])
     frame = WrenchFrame(daemon.fast.n - 1, np.array([0.0, 0.0, 0.1]))
     save_learned(daemon.service.external.path, Learned(listener, frame, 1.0))
     return daemon
@@ -89,7 +89,7 @@ def test_a_contact_is_streamed_at_once_and_counted(taught, tmp_path):
     taught.fast.push = lambda q: np.where(np.arange(q.shape[1]) == 1, -PUSH, 0.0) + 0.0 * q
     taught.run(3)
     taught.fast.push = None
-    told = [item.contact for item in client._items if isinstance(item, ContactItem)]
+    told = [item.contact for item in client._queue if isinstance(item, ContactItem)]
     client.close()
     answer = taught.view.external()
     assert told

@@ -13,10 +13,11 @@ from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
 from calib.daemon.environment import CLOSING_SECONDS
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import server as server_module
 from calib.daemon.web.connection import PEER, Peer
-from calib.daemon.web.guard import HEAD_LIMIT, LINGER_BYTES, RateLimit
+from calib.daemon.web.guard import HEAD_LIMIT, LINGER_BYTES
 
 MUCH = 100_000
 """Bytes; more than the server reads of any of these requests before it answers."""

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.service_view import ServiceView
-from calib.daemon.web.guard import RateLimit
 
 if TYPE_CHECKING:
     import schemathesis

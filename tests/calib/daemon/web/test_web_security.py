@@ -11,10 +11,11 @@ from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
 from armlink.errors import BadInput
+from calib.daemon.rate_limit import MOST_KEYS, Rate, RateLimit
 from calib.daemon.web import connection as connection_module
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web.connection import PEER, Peer
-from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Rate, RateLimit, RequestGuard
+from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, RequestGuard
 from calib.daemon.web.server import serve, unix_socket
 
 
@@ -70,9 +71,9 @@ def test_a_socket_left_by_a_killed_daemon_is_replaced_and_a_live_one_is_not(tmp_
 
 
 @pytest.mark.parametrize("token", [None, "", "short"])
-def test_tcp_without_a_proper_token_is_refused_at_the_start(token: str | None) -> None:
+def test_tcp_without_a_proper_token_is_refused_at_the_start(token: str | None, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="token of at least 16"):
-        asyncio.run(serve(MadeUpView(), socket=None, tcp=("127.0.0.1", 1), token=token))
+        asyncio.run(serve(MadeUpView(), socket=tmp_path / "api.sock", tcp=("127.0.0.1", 1), token=token))
 
 
 @pytest.mark.parametrize(
@@ -224,13 +225,14 @@ def test_a_connection_that_sends_no_whole_request_is_cut(
 
 
 def test_rate_limit_is_a_bucket_for_each_address() -> None:
-    limit = RateLimit(Rate(burst=3, per_second=2), keys=2)
+    limit = RateLimit(Rate(burst=3, per_second=2))
     assert [limit.take("a", 0.0) for _ in range(4)] == [0, 0, 0, 0.5]
     assert limit.take("b", 0.0) == 0
     assert limit.take("a", 0.5) == 0
     assert limit.take("a", 0.5) > 0
-    limit.take("c", 0.5)
-    assert len(limit._buckets) == 2
+    for number in range(2 * MOST_KEYS):
+        limit.take(f"another {number}", 0.5)
+    assert len(limit._buckets) == MOST_KEYS
 
 
 def guarded(peer: Peer, times: int, headers: list[tuple[bytes, bytes]]) -> list[int]:
