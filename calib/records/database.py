@@ -42,11 +42,8 @@ ACTIVATIONS = sa.Table("activations", TABLES, *_of_a_record(), *_texts("kind", "
 WRITES = sa.Table("writes", TABLES, *_of_a_record(), *_texts("arm", "serial", "at", "by", "stage"), _body())
 """Journal of writes to controllers: stage `begun` with the calibrations held before, then `finished` or `undone`."""
 
-REVISIONS = {"0001": (RECORDS, ACTIVATIONS), "0002": (WRITES,)}
-"""Revision of the schema → the tables that it brought, oldest first."""
-HEAD = max(REVISIONS)
-VERSION = sa.Table("alembic_version", TABLES, sa.Column("version_num", sa.String(32), primary_key=True))
-"""The revision of a store; stores of earlier versions were made by Alembic."""
+MIGRATIONS = ("0001", "0002")
+"""Revisions of the schema, oldest first; the last one makes the tables above."""
 
 
 def append_only(table: str, dialect: str) -> list[str]:
@@ -68,6 +65,7 @@ def append_only(table: str, dialect: str) -> list[str]:
     return []
 
 
+HEAD = MIGRATIONS[-1]
 BUSY_SECONDS = 10
 """Wait for another writer of an SQLite store [s]."""
 _POSTGRESQL = {
@@ -78,6 +76,7 @@ _POSTGRESQL = {
     "options": "-c statement_timeout=10000",
 }
 """Of libpq: how long it waits for a connection, and how long the server may work [s, s, s, –, ms]."""
+_VERSION = "alembic_version"
 _FILE = "file"
 """Key of a connection's notes: the identity of the file that it holds open."""
 FileIdentity = tuple[int, int] | None
@@ -218,7 +217,7 @@ def _store_name(engine: sa.Engine) -> str:
 
 
 def _migrate(engine: sa.Engine) -> None:
-    """Make the tables that the store lacks, up to HEAD; the oldest stores have those of 0001 and no revision."""
+    """Migrate the schema to HEAD; a store older than migrations has the tables of 0001 and no version."""
     with engine.connect() as connection:
         if _version(connection) == HEAD:
             return
@@ -227,20 +226,24 @@ def _migrate(engine: sa.Engine) -> None:
         found = _version(connection)
         if found == HEAD:  # another process was first
             return
-        if found is not None and found not in REVISIONS:
+        if found is not None and found not in MIGRATIONS:
             raise BadInput(
                 f"{_store_name(engine)}: its schema {found} is newer than schema {HEAD} of this armlink, so "
                 "nothing was changed: install a newer armlink"
             )
-        if found is None and sa.inspect(connection).has_table(RECORDS.name):
-            found = "0001"
-        for table in (each for revision, tables in REVISIONS.items() if revision > (found or "") for each in tables):
-            table.create(connection)
-            for statement in append_only(table.name, connection.dialect.name):
-                connection.exec_driver_sql(statement)
-        VERSION.create(connection, checkfirst=True)
-        connection.execute(VERSION.delete())
-        connection.execute(VERSION.insert().values(version_num=HEAD))
+        _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))
+
+
+def _upgrade(connection: sa.Connection, stamp: bool) -> None:
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.attributes["connection"] = connection
+    if stamp:
+        command.stamp(config, "0001")
+    command.upgrade(config, HEAD)
 
 
 def _lock(connection: sa.Connection) -> None:
@@ -249,9 +252,9 @@ def _lock(connection: sa.Connection) -> None:
 
 
 def _version(connection: sa.Connection) -> str | None:
-    if not sa.inspect(connection).has_table(VERSION.name):
+    if not sa.inspect(connection).has_table(_VERSION):
         return None
-    return connection.execute(sa.select(VERSION)).scalar()
+    return connection.execute(sa.text(f"SELECT version_num FROM {_VERSION}")).scalar()
 
 
 def _full_url(url: str) -> str:

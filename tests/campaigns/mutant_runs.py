@@ -32,7 +32,7 @@ def load() -> Live:
     """Load every module of ours, so that the children need not."""
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            if path.name != "__main__.py":  # run, never imported
+            if "migrations" not in path.parts and path.name != "__main__.py":  # run, never imported
                 importlib.import_module(module_name(str(path.relative_to(ROOT))))
     return Live()
 

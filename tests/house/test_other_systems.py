@@ -27,7 +27,8 @@ import importlib, pkgutil
 for package in ("armlink", "calib", "gcomp", "sim_bus", "sim_gap"):
     walked = pkgutil.walk_packages(importlib.import_module(package).__path__, package + ".")
     for module in walked:
-        importlib.import_module(module.name)
+        if "migrations" not in module.name:
+            importlib.import_module(module.name)
 
 from armlink import cli
 import armlink
