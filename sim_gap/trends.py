@@ -36,9 +36,9 @@ MOVES = 0.05
 def watched_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Watched parameters with 95 % intervals, of each joint that moves; none without a torque channel."""
     made = diagnosis.internals
-    if not isinstance(made, Internals) or made.nominal is None:
+    if not isinstance(made, Internals):
         return []
-    fit, layout = made.nominal, made.train.layout
+    fit, layout = made.fitted, made.train.layout
     moving = sum(s.moving.mean(0) for s in made.train.signals) / len(made.train.signals)
     main = {cause.effect for cause in diagnosis.causes} | {RIPPLE}
     kept = [term for term in fit.terms if term.effect in main and term.effect not in WATCHED]
@@ -89,12 +89,16 @@ Key = tuple[str, str, str, str]
 
 
 @dataclass(frozen=True)
-class Trend:
+class ArmParameter:
     arm: str
     effect: str
     joint: str
     parameter: str
     unit: str
+
+
+@dataclass(frozen=True)
+class Trend(ArmParameter):
     before: float
     now: float
     since: str
@@ -104,14 +108,9 @@ class Trend:
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """One parameter of one arm that differs from the same of the other arms."""
+class Outlier(ArmParameter):
+    """One that differs from the same of the other arms."""
 
-    arm: str
-    effect: str
-    joint: str
-    parameter: str
-    unit: str
     value: float
     others: float
     """Median of all arms."""

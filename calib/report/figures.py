@@ -1,5 +1,6 @@
-"""Figures of the calibration reports: sweeps with their fits, before and after, and the paper's Figure 6."""
+"""Figures of the calibration reports: sweeps with their fits, before and after, the paper's Figure 6, the observer."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from plotly.subplots import make_subplots
 from calib.fit.calibration import rms
 from calib.fit.creep_fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
+from calib.observer.watch_loop import WatchHistory
 from calib.report.page import COLOURS
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
@@ -19,7 +21,7 @@ from gcomp.identify.sensor_model import predict
 
 Indices = npt.NDArray[np.intp]
 
-GREY = "#9aa7b3"
+GREY, MARK, CURVE = "#9aa7b3", "#d9622b", "#1f5fa8"
 CURVE_POINTS = 60
 PANEL = 230
 """Height of a row of panels [px]."""
@@ -115,6 +117,31 @@ def verify_figure(check: Verification) -> Any:
         [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],
         "pose number",
     )
+
+
+def watch_figure(
+    history: WatchHistory, joint: int, truth: tuple[Sequence[float], Array], marks: Sequence[tuple[float, str]]
+) -> Any:
+    """The observer's gain and offset of a joint over time with 95 % bands, and what happened when.
+
+    `truth` is times (K,) and true values (2, K).
+    """
+    t, figure = np.array(history.t), make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.08)
+    for row, (name, title) in enumerate((("gain", "gain"), ("offset", "offset [N·m]"))):
+        value, std = (np.array(getattr(history, key))[:, joint] for key in (name, f"{name}_std"))
+        place = {"showlegend": row == 0, "row": row + 1, "col": 1}
+        band = np.concatenate([value + 1.96 * std, (value - 1.96 * std)[::-1]])
+        paint = {"fill": "toself", "fillcolor": "rgba(31,95,168,0.18)", "line": {"width": 0}, "hoverinfo": "skip"}
+        figure.add_scatter(x=np.concatenate([t, t[::-1]]), y=band, name="95 % interval", **paint, **place)
+        figure.add_scatter(x=t, y=value, name="observer", line={"color": CURVE}, **place)
+        figure.add_scatter(x=truth[0], y=truth[1][row], name="truth", line={"color": GREY, "dash": "dot"}, **place)
+        figure.update_yaxes(title_text=title, row=row + 1, col=1)
+    anchor = {"showarrow": False, "xanchor": "left", "yanchor": "bottom", "y": 1.0, "yref": "y domain"}
+    for when, text in marks:
+        figure.add_vline(x=when, line={"color": MARK, "width": 1}, row="all", col=1)
+        figure.add_annotation(x=when, text=text, **anchor)
+    figure.update_xaxes(title_text="link time [s]", row=2)
+    return figure.update_layout(height=520, legend={"orientation": "h", "y": 1.1, "x": 0})
 
 
 def _panels(titles: list[str], pairs: list[tuple[Array, Array]], along: str) -> Any:

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 from xml.parsers import expat
 
@@ -43,6 +44,15 @@ def upwards(model: "mujoco.MjModel", body: int) -> list[int]:
     while found[-1]:
         found.append(int(model.body_parentid[found[-1]]))
     return found
+
+
+def carried_bodies(model: "mujoco.MjModel", bodies: Iterable[int]) -> list[int]:
+    """These bodies and those that they carry."""
+    found = {int(body) for body in bodies}
+    for body in range(1, model.nbody):
+        if int(model.body_parentid[body]) in found:
+            found.add(body)
+    return sorted(found)
 
 
 def coupled_joints(model: "mujoco.MjModel") -> dict[str, str]:

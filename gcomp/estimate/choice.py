@@ -232,15 +232,16 @@ class LinearTerms:
             own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
             half = np.linalg.solve(np.linalg.cholesky(own), scale[:, None] * gram[index])
             left = side - gram[:, index] @ change
-            gram = np.asarray(gram - half.T @ half)
         else:
-            left = side
+            half, left = np.zeros((0, len(gram))), side
         out = np.zeros(len(candidates))
         widths = np.array([len(each) for each in candidates])
         for width in np.unique(widths):
             same = np.flatnonzero(widths == width)
             own = np.array([candidates[k] for k in same.tolist()], np.intp)
-            blocks = gram[own[:, :, None], own[:, None, :]] + floor[own][:, :, None] * np.eye(width)
+            taken = np.moveaxis(half[:, own], 0, -1)  # by the free parameters, which adapt
+            blocks = gram[own[:, :, None], own[:, None, :]] - taken @ taken.swapaxes(1, 2)
+            blocks += floor[own][:, :, None] * np.eye(width)
             aim = left[own]
             low, high = self.low[own], self.high[own]
             held = low == high

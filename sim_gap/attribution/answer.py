@@ -1,6 +1,5 @@
 """The answer of a diagnosis around its causes: verdict, gap before and after, roll-out, notes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,14 +7,14 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.causes import remainder
-from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 from sim_gap.attribution.notes import aside_notes, law_notes, notes, worse_notes
-from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_laws
+from sim_gap.attribution.residual_laws import as_effects, residual_laws
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps
-from sim_gap.residuals.location import Location, by_joint, locate, row_rms
+from sim_gap.residuals.location import by_joint, locate, row_rms
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate
 
@@ -27,24 +26,25 @@ class Internals:
     model: SimModel
     train: ResidualSet
     heldout: ResidualSet
-    estimate: EffectEstimate | None
-    """None if there is no gap."""
-    recordings: tuple[Recording, ...] = ()
+    estimate: EffectEstimate
+    """Without a term if there is no gap."""
+    recordings: tuple[Recording, ...]
     """Held-out recordings."""
-    nominal: EffectEstimate | None = None
+    fitted: EffectEstimate
     """The fit even if there is no gap."""
 
 
 def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
     """The diagnosis from its causes, the minor ones, and a description of the held-out data."""
     fit, judge, estimate = made.train, made.heldout, made.estimate
-    left, left_fit = (
-        remainder(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
-    )
+    explained = estimate.predict(judge)
+    left, left_fit = remainder(judge, explained), remainder(fit, estimate.predict(fit))
     stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
     sets = [(judge, left), *([(fit, left_fit)] if found else [])]
     friction = _dry_friction(made.model.arm.frictionloss, estimate)
-    aside, laws = _aside(made, estimate, friction), residual_laws(fit, judge, left_fit, left, friction)
+    known = [row for row in fit.rows if slides(fit, row)]
+    aside = [*slow_gaps(judge, explained, friction, known), *fast_gaps(judge, made.recordings)]
+    laws = residual_laws(fit, judge, left_fit, left, friction)
     result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
@@ -67,7 +67,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         unexplained=share_left(judge, left),
         margin=margin,
         heldout_is=heldout_is,
-        rollout=_rolled(made, found, laws),
+        rollout=roll_out(made.model, judge, made.recordings, estimate, found, as_effects(laws, made.model.arm.names)),
         laws=tuple(laws),
         notes=(
             *notes(found, stuck, estimate, fit, judge, left),
@@ -79,34 +79,10 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     )
 
 
-def _dry_friction(nominal: Array, estimate: EffectEstimate | None) -> Array:
+def _dry_friction(nominal: Array, estimate: EffectEstimate) -> Array:
     """Dry friction of the joints as far as it is known: the model's, and what was found beside it [N·m], (n,)."""
     friction = nominal.copy()
-    for term in estimate.terms if estimate is not None else ():
+    for term in estimate.terms:
         if term.effect == "friction.coulomb":
-            friction[term.place] += estimate.of(term)[0] if estimate is not None else 0.0
+            friction[term.place] += estimate.of(term)[0]
     return np.maximum(friction, 0.0)
-
-
-def _aside(made: Internals, estimate: EffectEstimate | None, friction: Array) -> list[Location]:
-    """Gaps at rest, in creep and above the band on held-out data."""
-    judge = made.heldout
-    zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}
-    explained = zero if estimate is None else estimate.predict(judge)
-    known = [row for row in made.train.rows if slides(made.train, row)]
-    return [*slow_gaps(judge, explained, friction, known), *fast_gaps(judge, made.recordings)]
-
-
-def _rolled(made: Internals, found: list[Cause], laws: Sequence[ResidualLaw]) -> Rollout | None:
-    """Roll-outs of the exported files along the held-out recordings."""
-    if made.nominal is None or not made.recordings:
-        return None
-    return roll_out(
-        made.model,
-        made.heldout,
-        made.recordings,
-        made.estimate,
-        found,
-        made.nominal,
-        as_effects(laws, made.model.arm.names),
-    )

@@ -104,8 +104,7 @@ def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: in
     the squares of the rows with a gap that it leaves; one without a gap."""
     data = store.data
     explained = estimate.predict(data, store)
-    start = sum(data.lengths[:recording])
-    part = slice(start, start + data.lengths[recording])
+    part = data.parts[recording]
     gram, side, rows = np.zeros((4, 4)), np.zeros(4), []
     for row, columns in store.columns(body).items():
         valid = data.valid[row][part]

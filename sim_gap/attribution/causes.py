@@ -45,7 +45,7 @@ class _Scorer:
 
     def squares(self, terms: list[Term]) -> Array:
         """Held-out mean square per row after fitting these terms to the training set, (R,)."""
-        return self.equations.mean_square(self.estimate.subset(terms))
+        return self.equations.linear.mean_squares(self.estimate.subset(terms))
 
     def signs(self, terms: tuple[Term, ...], evidence: float, outside: float) -> Signs:
         """The evidence for and against a cause, on the row that increases most without its terms."""

@@ -136,10 +136,8 @@ def diagnose(
     fit = estimate.store.data
     within = not fit.impacts and is_within(judge) and is_within(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, within=within)
-    shown = estimate if found or not within else None
-    made = answer(
-        Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor if shown else [], heldout_is
-    )
+    shown, minor = (estimate, minor) if found or not within else (EffectEstimate(estimate.store, ()), [])
+    made = answer(Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor, heldout_is)
     compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))
@@ -216,7 +214,8 @@ def checked_recordings(
         matched.append(stated.apply(taken, label).check(label))
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
-    sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)
+    path = Path(source) if isinstance(source, str | Path) else None
+    sim = load_model(compiled_model, names, matched[0].n, hinges, path)
     alone = all(is_position_only(recording) for recording in matched)
     require_length(matched, labels, 0.0 if alone else SHORTEST_PIECE_S)
     if alone:

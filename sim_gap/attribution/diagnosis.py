@@ -167,7 +167,7 @@ class Diagnosis:
             "friction_compensation": [_fields(each) for each in self.friction_compensation],
             "checks": [finding.to_json() for finding in self.checks],
         }
-        return {name: _plain(value) for name, value in answer.items()}
+        return {name: plain_json(value) for name, value in answer.items()}
 
 
 def _fields(record: Any, *left_out: str) -> dict[str, Any]:
@@ -204,12 +204,12 @@ def _law(law: ResidualLaw, names: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """Value as in JSON: numbers with six digits, none that are not finite."""
+def plain_json(value: Any, digits: int = 6) -> Any:
+    """Value as in JSON: numbers with so many digits, none that are not finite."""
     if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: plain_json(each, digits) for name, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(each) for each in value]
+        return [plain_json(each, digits) for each in value]
     if isinstance(value, float | np.floating):
-        return float(f"{value:.6g}") if np.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
     return value

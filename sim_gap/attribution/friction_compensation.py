@@ -92,12 +92,12 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
         return None
     best: tuple[float, float, float] | None = None
     smooth = np.asarray(savgol_filter(velocity, SMOOTHING_SAMPLES, 2, mode="nearest"))
-    bent = _bent(command)[LAGS - 1 :]
+    bent = np.diff(command, 2)[LAGS - 1 :]
     there = np.flatnonzero(np.isfinite(bent))
     there = there[:: len(there) // 10_000 + 1]  # so many samples are looked at
     for speed in SPEEDS:
-        laws = (*(_dry(v, speed) for v in (velocity, smooth)), np.sign(smooth), velocity, smooth, position)
-        bends = [_bent(law) for law in laws]
+        dry = (2.0 / np.pi * np.arctan(v / speed) for v in (velocity, smooth))
+        bends = [np.diff(law, 2) for law in (*dry, np.sign(smooth), velocity, smooth, position)]
         x = np.stack([bend[LAGS - 1 - lag : len(bend) - lag][there] for bend in bends for lag in range(LAGS)], axis=1)
         known = np.isfinite(x).all(axis=1)
         x, y = x[known], bent[there][known]
@@ -119,14 +119,6 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
     return best[1:] if best else None
 
 
-def _dry(velocity: Array, speed: float) -> Array:
-    return np.asarray(2.0 / np.pi * np.arctan(velocity / speed))
-
-
-def _bent(x: Array) -> Array:
-    return np.asarray(np.diff(x, 2))
-
-
 @dataclass(frozen=True)
 class _Friction:
     """Friction of a joint in one recording: torque that opposes the motion, at its mean speed [N·m]."""
@@ -138,7 +130,7 @@ class _Friction:
     """Standard error, from blocks of time [N·m]."""
 
 
-def find_compensations(estimate: EffectEstimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
+def find_compensations(estimate: EffectEstimate, sets: Sequence[ResidualSet]) -> list[Compensation]:
     """Recordings in which joints have none of the friction that most others show, or drive themselves on.
 
     It must be more than half of the joints that show friction at all: a controller compensates an arm's, and one joint
@@ -161,22 +153,19 @@ def find_compensations(estimate: EffectEstimate | None, sets: Sequence[ResidualS
     return [each for each in out.values() if 2 * lacking.count(each.recording) > len(shown[each.recording])]
 
 
-def _frictions(estimate: EffectEstimate | None, data: ResidualSet) -> list[_Friction]:
+def _frictions(estimate: EffectEstimate, data: ResidualSet) -> list[_Friction]:
     """Friction of each joint in each recording, all other effects as estimated."""
-    store = estimate.on(data) if estimate is not None else None
-    links = tuple(term for term in estimate.terms if not term.effect.startswith("friction.")) if estimate else ()
-    known = estimate.predict(data, store, links) if estimate is not None else {}
-    out, first = [], 0
-    for s, length in zip(data.signals, data.lengths, strict=True):
-        part = slice(first, first + length)
-        first += length
+    links = tuple(term for term in estimate.terms if not term.effect.startswith("friction."))
+    known = estimate.predict(data, terms=links)
+    out = []
+    for s, part in zip(data.signals, data.parts, strict=True):
         for row in data.rows:
             if row[0] == data.layout.sensor or data.layout.reference(row):
                 continue
             valid = data.valid[row][part]
             if valid.sum() < FEWEST_MOVING:
                 continue
-            y = (data.values[row] - known.get(row, np.zeros(len(data.time))))[part][valid]
+            y = (data.values[row] - known[row])[part][valid]
             out.append(_friction(s, row, y, valid, data.blocks[part][valid]))
     return out
 

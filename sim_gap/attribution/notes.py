@@ -25,7 +25,7 @@ WORSE = 1.1
 def notes(
     found: Sequence[Cause],
     stuck: Sequence[Stuck],
-    estimate: EffectEstimate | None,
+    estimate: EffectEstimate,
     fit: ResidualSet,
     judge: ResidualSet,
     left: dict[Row, Array],
@@ -98,24 +98,24 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def _at_bounds(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
+def _at_bounds(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     names = fit.signals[0].arm.names
     return tuple(
         f"{term.effect} of {'the arm' if term.form.signature.whole_arm else names[term.place]} has reached "
         "the largest or least value that can exist: these recordings do not determine its size"
-        for term in (estimate.at_bounds() if estimate is not None else ())
+        for term in estimate.at_bounds()
     )
 
 
-def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
+def _common_factor(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
-    if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
+    if masses_may_be_constants(fit.layout, estimate.terms):
         return (
             f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
             "constants were wrong by one factor, the recordings would look the same; creep sweeps with a weighed mass "
             "show whether the masses or the constants are wrong",
         )
-    if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
+    if not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (
         f"{CONSTANT}: {fit.layout.motor} alone does not determine the common scale of masses and torque constants: if "
@@ -125,10 +125,10 @@ def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[s
     )
 
 
-def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
+def _bound(estimate: EffectEstimate, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
     """A note for effects in some recordings alone, and for a payload that includes model errors of the links."""
     lines = []
-    for term in () if estimate is None else estimate.terms:
+    for term in estimate.terms:
         if alone := recordings_with(term, (fit, judge)):
             lines.append(f"{term.effect} is present only in {' and '.join(alone)}")
         elif term.effect == "link.payload":
@@ -138,8 +138,10 @@ def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet
             )
         if term.effect == "link.payload":
             lines += _turned((fit, judge))
-        if term.effect == "link.payload" and estimate is not None and estimate.of(term)[0] < 0.0:
-            lines.append("link.payload: its mass is negative, so the model has a body at its tip that the arm lacks")
+            if estimate.of(term)[0] < 0.0:
+                lines.append(
+                    "link.payload: its mass is negative, so the model has a body at its tip that the arm lacks"
+                )
     return tuple(lines)
 
 

@@ -10,11 +10,11 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
+from sim_gap.attribution.verdict import NEAR
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import groups_of
-from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
-from sim_gap.position_gap.judge import LEAST_SHRINK, Stage
+from sim_gap.position_gap.choice import LEAST_SHRINK, Stage, groups_of
+from sim_gap.position_gap.identify import Identified, identify
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.training.export import WRITTEN
 from sim_gap.position_gap.training.replay import (
@@ -31,8 +31,6 @@ from sim_gap.residuals.location import Location
 from sim_gap.residuals.residual_set import EXPLAINED
 from sim_gap.search.estimate import Value
 
-STRUCTURE = 2.0
-"""Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75
 """Highest confidence that positions alone give, below the 0.8 from which a cause is no hint: the sealed cases that
 calibrate confidence all have torques."""
@@ -61,7 +59,11 @@ def diagnose_positions(
     progress("replaying the corrected model")
     share = _left(found)
     made = [_cause(found, stage, share) for stage in found.stages]
-    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    taken = [
+        (c, stage)
+        for c, stage in zip(made, found.stages, strict=True)
+        if _lowers(found, stage) and _differs(found, stage)
+    ]
     causes = [c for c, _ in taken]
     minor = [c for c in made if c not in causes]
     verdict = _verdict(found, causes, share)
@@ -70,12 +72,13 @@ def diagnose_positions(
     rollout = _rollout(found, taken)
     if verdict != "no_gap" and rollout is not None and rollout.worse:
         verdict = "unexplained"
-    capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
+    if verdict == "unexplained":
+        causes = [replace(cause, confidence=min(cause.confidence, HINT)) for cause in causes]
     return Diagnosis(
         verdict=verdict,
         names=sim.arm.names,
         where=_where(found),
-        causes=tuple(capped),
+        causes=tuple(causes),
         minor=tuple(minor),
         noise_floor=found.search.floor,
         train_before=found.train_before,
@@ -101,10 +104,6 @@ def _left(found: Identified) -> float:
     return float(left / max(float(np.maximum(found.heldout_before**2 - floor, 0.0).sum()), 1e-18))
 
 
-def _matters(found: Identified, stage: Stage) -> bool:
-    return _lowers(found, stage) and _differs(found, stage)
-
-
 def _lowers(found: Identified, stage: Stage) -> bool:
     """Whether it lowers the gap of a joint that has one."""
     gap = np.maximum(stage.before, found.heldout_before)
@@ -113,12 +112,7 @@ def _lowers(found: Identified, stage: Stage) -> bool:
 
 def _differs(found: Identified, stage: Stage) -> bool:
     """Whether some parameter's interval leaves out the nominal value."""
-    effect, joints = stage.group
-    if not joints:
-        places = [(-1, name) for name in columns_of_effect(found, effect)]
-    else:
-        places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
-    for j, name in places:
+    for j, name in found.search.places_of(stage.group):
         _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
         if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
             return True
@@ -128,9 +122,9 @@ def _differs(found: Identified, stage: Stage) -> bool:
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
     if _is_within(found) or (not causes and _is_small(found)):
         return "no_gap"
-    if not bool(np.all(found.train_after < np.maximum(2.0 * found.margin, EXPLAINED * found.train_before))):
+    if not bool(np.all(found.train_after < np.maximum(NEAR * found.margin, EXPLAINED * found.train_before))):
         return "unexplained"
-    near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
+    near = found.heldout_after < np.maximum(NEAR * found.margin, EXPLAINED * found.heldout_before)
     if _structure_left(found):
         return "unexplained"
     if not causes or np.sqrt(share) > 2.0 * EXPLAINED or not near.any():
@@ -152,12 +146,12 @@ def _is_small(found: Identified) -> bool:
     """Whether no joint's gap is more than twice what matters, in training and held-out motion alike, in windows and
     running free."""
     free = (gap for gap in (found.moved_train, found.moved_before) if not np.isnan(gap).all())
-    return all(bool(np.all(gap < 2.0 * found.margin)) for gap in (found.train_before, found.heldout_before, *free))
+    return all(bool(np.all(gap < NEAR * found.margin)) for gap in (found.train_before, found.heldout_before, *free))
 
 
 def _structure_left(found: Identified) -> bool:
     """Whether the controller is unknown and some joint keeps a gap: then it may not be of the kind that was fitted."""
-    return found.search.open_controller and bool(np.any(found.heldout_after > STRUCTURE * found.margin))
+    return found.search.open_controller and bool(np.any(found.heldout_after > NEAR * found.margin))
 
 
 def _cause(found: Identified, stage: Stage, share: float) -> Cause:
@@ -168,7 +162,8 @@ def _cause(found: Identified, stage: Stage, share: float) -> Cause:
     before, after = (float(np.sqrt(np.mean(x[places] ** 2))) for x in (stage.before, stage.after))
     name, _, link = effect.partition("@")
     listed = tuple(names[j] for j in joints) or ((link,) if link else names)
-    evidence = stage.evidence / max(PRICE * _size(effect, found), 1.0)
+    size = len(found.search.places_of((effect, joints[:1])))
+    evidence = stage.evidence / max(PRICE * size, 1.0)
     confidence = ALMOST - (ALMOST - HINT) * float(np.exp(-0.35 * max(evidence - 1.0, 0.0)))
     if stage.rivals:
         confidence = min(confidence, 0.7)
@@ -190,19 +185,14 @@ def _cause(found: Identified, stage: Stage, share: float) -> Cause:
     )
 
 
-def _size(effect: str, found: Identified) -> int:
-    return len(EFFECTS[effect].parameters) if effect in EFFECTS else len(columns_of_effect(found, effect))
-
-
 def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
     effect, joints = stage.group
     if not joints:
-        columns = columns_of_effect(found, effect)
+        columns = [name for _, name in found.search.places_of(stage.group)]
         place = effect.partition("@")[2] or "arm"
         values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
-        if effect == "link.payload" and "mass" in values:
-            centre = {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
-            values |= centre
+        if effect == "link.payload":
+            values |= {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
         return {place: values}
     own = EFFECTS[effect]
     return {
@@ -212,10 +202,6 @@ def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
         }
         for j in joints
     }
-
-
-def _hint(cause: Cause) -> Cause:
-    return replace(cause, confidence=min(cause.confidence, HINT))
 
 
 def _where(found: Identified) -> tuple[Location, ...]:

@@ -1,17 +1,17 @@
 """Notes of an answer from positions alone: what they leave open, and where the exported model is further off."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.plant import held_parts
 from sim_gap.position_gap.start import controller_name
 from sim_gap.position_gap.training.bands import SHARE
-from sim_gap.position_gap.training.export import Exported, effects_left_out, widened_joints
+from sim_gap.position_gap.training.export import effects_left_out, widened_joints
 from sim_gap.position_gap.training.spread import interval, undecided_scale
 from sim_gap.position_gap.training.unreached_limits import describe
-from sim_gap.position_gap.windows import Windows
 
 FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
@@ -55,13 +55,10 @@ def notes(found: Identified) -> list[str]:
     out += [*_early(found), *_held(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     left = effects_left_out(found.search, found.fit) if found.sim.path is not None else []
     if left:
-        module = f"; a separate model with a module applies {_in_module(found.beside)}" if found.beside else ""
+        applied = [f"{effect} {joint}" for effect, joint, _ in found.beside.effects] if found.beside else []
+        module = f"; a separate model with a module applies {', '.join(applied)}" if applied else ""
         out.append(f"the corrected model leaves out: {', '.join(left)}{module}")
     return out
-
-
-def _in_module(beside: Exported) -> str:
-    return ", ".join(f"{effect} {joint}" for effect, joint, _ in beside.effects)
 
 
 def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> list[str]:
@@ -83,7 +80,12 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
         for j in np.flatnonzero(left > FAR * least)
     ]
     told = "in a free-running simulation of the held-out motion, the corrected model leaves a larger gap than the fit"
-    return [*out, f"{told}: {', '.join(far)}"] if far else out
+    return [*out, *_note(told, far)]
+
+
+def _note(told: str, where: Sequence[str], advice: str = "") -> list[str]:
+    """A note with the places that it holds for; none without a place."""
+    return [f"{told}: {', '.join(where)}" + (f": {advice}" if advice else "")] if where else []
 
 
 def _early(found: Identified) -> list[str]:
@@ -110,11 +112,8 @@ def _early(found: Identified) -> list[str]:
 def _held(found: Identified) -> list[str]:
     """A note of what lies outside of the arm and could move by itself."""
     held = held_parts(found.sim)
-    if not held:
-        return []
-    some = ", ".join(held[:MOST_NAMED]) + (", …" if len(held) > MOST_NAMED else "")
     told = "these parts of the model do not move and touch nothing, since they are not between --base and --tip"
-    return [f"{told}: {some}"]
+    return _note(told, [*held[:MOST_NAMED], "…"] if len(held) > MOST_NAMED else held)
 
 
 def _ranges(found: Identified) -> list[str]:
@@ -125,8 +124,7 @@ def _ranges(found: Identified) -> list[str]:
         for j in widened_joints(found.sim)
         for low, high in [found.sim.arm.range[j]]
     ]
-    told = "these joints move beyond the joint range of the model, where a simulation would stop them"
-    return [f"{told}: {', '.join(out)}"] if out else []
+    return _note("these joints move beyond the joint range of the model, where a simulation would stop them", out)
 
 
 def _beyond(found: Identified) -> list[str]:
@@ -140,20 +138,20 @@ def _beyond(found: Identified) -> list[str]:
         if outside > 1.0 - SHARE:
             out.append(f"{name}: {outside:.0%} of the held-out motion")
     told = "these joints move outside of the range of the training recordings, where the band may be too narrow"
-    return [f"{told}: {', '.join(out)}"] if out else []
+    return _note(told, out)
 
 
 def _faster(found: Identified) -> list[str]:
     """A note of the joints that are at times faster than in what is fitted of the training."""
     out = []
     for j, name in enumerate(found.sim.arm.names):
-        fitted, other = (_speeds(data, j) for data in (found.search.data, found.heldout))
+        fitted, other = (np.abs(d.v[:, j][d.weight[:, j] > 0.0]) for d in (found.search.data, found.heldout))
         if not (fitted.size and other.size):
             continue
         if np.mean(other > fitted.max()) > AT_TIMES:
             out.append(f"{name} up to {other.max():.2g} rad/s (in training {fitted.max():.2g})")
     told = "the held-out motion is faster than all training motion, so the fit may not hold for it"
-    return [f"{told}: {', '.join(out)}: add faster motion to --train"] if out else []
+    return _note(told, out, "add faster motion to --train")
 
 
 def _released(found: Identified) -> list[str]:
@@ -165,9 +163,4 @@ def _released(found: Identified) -> list[str]:
         if off[0][j] == 0.0 < off[1][j]
     ]
     told = "the servo is off in part of the held-out motion, but never in training, so the fit may not hold there"
-    return [f"{told}: {', '.join(out)}: add such a recording, with the servo off, to --train"] if out else []
-
-
-def _speeds(data: Windows, joint: int) -> Array:
-    """Amounts of a joint's velocity at the judged samples [rad/s], (K,)."""
-    return np.asarray(np.abs(data.v[:, joint])[data.weight[:, joint] > 0.0])
+    return _note(told, out, "add such a recording, with the servo off, to --train")

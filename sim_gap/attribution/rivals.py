@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcomp.estimate.exchange import AS_GOOD as NO_FALL
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
@@ -19,9 +20,6 @@ AS_GOOD = 0.036
 coefficients of a long recording, for the background of every arm can favour either by that much."""
 BARE = AS_GOOD / 3.0
 """A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
-ALIKE = 1e-6
-"""Difference of two scores, apart from their prices, up to which two effects fit exactly alike: then the dearer one is
-a rival of the cheaper one, too."""
 NEAR = 0.3
 """A rival within this is fitted about itself, if the columns of either depend on the other."""
 TRIED, LAWS_TRIED = 4, 3
@@ -99,7 +97,8 @@ class Rivals:
                 worse = min(worse, self._refitted(trial, rest))
             weakest = min(weakest, worse)
             dearer = (choice.price(trial) - choice.price(choice.current)) / choice.equations.measurements
-            good = worse < AS_GOOD or abs(worse - dearer) < ALIKE
+            alike = abs(worse - dearer) * choice.equations.measurements < NO_FALL  # but for their prices
+            good = worse < AS_GOOD or alike
             if good and worse < enough and other.effect != term.effect:
                 rivals.append(other.effect)
         return weakest, rivals

@@ -14,10 +14,10 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
-from sim_gap.better_model.corrected_model import spec_of, with_effects
+from sim_gap.better_model.corrected_model import with_effects
 from sim_gap.better_model.export import CorrectedText, joint_effects, model_files, module_text
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.model.load import SimModel, silent
+from sim_gap.model.load import SimModel, named_spec, silent
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate
@@ -41,7 +41,7 @@ class RollOuts:
     ) -> None:
         """`laws` go with every simulation of effects, none with that of the nominal model."""
         self.sim, self.recordings, self.estimate, self.laws = sim, recordings, estimate, tuple(laws)
-        self.spec = spec_of(sim) if sim.path is not None else None
+        self.spec = named_spec(sim) if sim.path is not None else None
         self.bodies = [(s.number, s.mount) for s in heldout.signals]
         self.channel = CHANNELS[heldout.layout.motor_side]
         self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
@@ -79,19 +79,18 @@ def roll_out(
     sim: SimModel,
     heldout: ResidualSet,
     recordings: Sequence[Recording],
-    estimate: EffectEstimate | None,
+    estimate: EffectEstimate,
     causes: Sequence[Cause],
-    nominal: EffectEstimate,
     laws: Sequence[JointEffect] = (),
 ) -> Rollout:
     """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
 
-    `estimate` is None if there is no gap; `nominal` stands for it then. Effects whose absence costs most come first.
+    Effects whose absence costs most come first.
     """
-    runs = RollOuts(sim, heldout, recordings, estimate or nominal, laws)
+    runs = RollOuts(sim, heldout, recordings, estimate, laws)
     horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
     before = runs.of((), windows)
-    if estimate is None:
+    if not estimate.terms:
         return Rollout(horizon, before, before)
     after = runs.of(estimate.terms, windows)
     out = []

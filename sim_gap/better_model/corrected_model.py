@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from armlink.errors import BadInput
-from gcomp.arm.inertials import body_parameters, pseudo_inertia, set_body, write_bodies
+from gcomp.arm.inertials import body_parameters, fixed_body_parameters, pseudo_inertia, set_body, write_bodies
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
-from sim_gap.effects.base import tilt_gravity
-from sim_gap.effects.link import mount_matrix
+from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.model.load import SimModel, named_spec
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.estimate import EffectEstimate
@@ -63,7 +61,7 @@ class CorrectedModel:
 
 def with_effects(
     sim: SimModel,
-    estimate: EffectEstimate | None,
+    estimate: EffectEstimate,
     terms: Sequence[Term] | None = None,
     number: int = 0,
     mount: float = 0.0,
@@ -73,8 +71,6 @@ def with_effects(
     A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
     `mount` about the last joint's axis [rad].
     """
-    if estimate is None:
-        return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
     chosen = estimate.terms if terms is None else tuple(terms)
     model, coupled = _base(sim, estimate, chosen)
     bent = {term.place for term in chosen if term.effect in OF_READING}
@@ -112,12 +108,16 @@ def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], n
 def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
     """Add ten parameters to the body that a joint moves, or to it with all that is fixed to it if it alone could not
     exist (a gripper taken away); whether the result is what was wanted."""
+    import mujoco
+
     joint = joints[link]
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
     total = body_parameters(model, body, anchor, np.eye(3)) + added
     if not may_exist(total):
-        fixed = _fixed_to(model, body, joints)
-        whole = total + sum((_seen_from(model, other, body, anchor) for other in fixed), np.zeros(10))
+        fixed, data = _fixed_to(model, body, joints), mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        beside = (fixed_body_parameters(model, data, other, body, anchor) for other in fixed)
+        whole = total + sum(beside, np.zeros(10))
         if fixed and may_exist(whole):
             total = whole
             for other in fixed:
@@ -136,18 +136,6 @@ def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
     return out
 
 
-def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
-    """Ten parameters of a body that is fixed to another, about that one's anchor and in its frame."""
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    up, own = data.xmat[body].reshape(3, 3), data.xmat[other].reshape(3, 3)
-    turn = up.T @ own
-    place = up.T @ (data.xpos[other] - data.xpos[body]) - anchor
-    return body_parameters(model, other, -turn.T @ place, turn)
-
-
 def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
 
@@ -163,26 +151,9 @@ def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> tup
     """A copy of the nominal model with its coupled motors, and whether it has any (only a model from a file can)."""
     if sim.path is None or not any(term.effect == "transmission.coupling" for term in terms):
         return copy.copy(sim.mujoco_model), False
-    spec = spec_of(sim)
+    spec = named_spec(sim)
     add_motors(spec, sim, estimate, terms)
     return spec.compile(), True
-
-
-def spec_of(sim: SimModel) -> Any:
-    """The nominal model's file as a `mujoco.MjSpec` (`named_spec`).
-
-    Raises BadInput if the model did not come from a file.
-    """
-    if sim.path is None:
-        raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
-    return named_spec(sim)
-
-
-def compiled_copy(spec: Any) -> Any:
-    """A copy of a `mujoco.MjSpec`, its elements numbered."""
-    own = spec.copy()
-    own.compile()
-    return own
 
 
 def write_changes(spec: Any, sim: SimModel, model: Any) -> None:

@@ -11,16 +11,14 @@ from calib.arm.urdf import URDF, urdf_of, xml_comment
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,
-    compiled_copy,
     offsets,
-    spec_of,
     with_effects,
     write_changes,
 )
-from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
+from sim_gap.better_model.forward_effects import STEP_S, JointEffect
+from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
 from sim_gap.effects.torque import is_gradual
-from sim_gap.model.load import SimModel, urdf_behind
+from sim_gap.model.load import SimModel, named_spec, urdf_behind
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
@@ -40,7 +38,7 @@ class CorrectedText:
 
 def model_files(
     sim: SimModel,
-    estimate: EffectEstimate | None,
+    estimate: EffectEstimate,
     name: str,
     terms: Sequence[Term] | None = None,
     number: int = 0,
@@ -54,21 +52,24 @@ def model_files(
     `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
     it is copied.
     """
-    chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
-    spec = spec_of(sim) if spec is None else compiled_copy(spec)
+    chosen = estimate.terms if terms is None else tuple(terms)
+    if spec is None:
+        spec = named_spec(sim)
+    else:
+        spec = spec.copy()
+        spec.compile()  # which numbers its elements
     corrected = with_effects(sim, estimate, chosen, number, mount)
     write_changes(spec, sim, corrected.model)
-    if estimate is not None:
-        add_motors(spec, sim, estimate, chosen)
+    add_motors(spec, sim, estimate, chosen)
     motors, drives = motors_of(spec), _drives(sim, estimate, chosen)
     for joint, drive in drives.items():
         if joint in motors:
             put_drive(motors[joint], drive)
     if any("actuator.delay" in drive and joint in motors for joint, drive in drives.items()):
-        spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
+        spec.option.timestep = min(float(spec.option.timestep), STEP_S)
     spec.compile()
     left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
-    lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
+    lines = [_line(sim, estimate, term) for term in left]
     lines += [
         f"{name}: no body can have the fitted inertia of its link, so the file has the nearest possible inertia"
         for name in corrected.changed
@@ -76,13 +77,11 @@ def model_files(
     lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
-    effects = [] if estimate is None else joint_effects(sim, estimate, corrected.not_held, corrected.held)
+    effects = joint_effects(sim, estimate, corrected.not_held, corrected.held)
     return CorrectedText(comment + spec.to_xml(), tuple(lines), (*effects, *laws), spec)
 
 
-def write_model(
-    sim: SimModel, estimate: EffectEstimate | None, path: Path, laws: Sequence[JointEffect] = ()
-) -> list[str]:
+def write_model(sim: SimModel, estimate: EffectEstimate, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
     """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
 
     The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
@@ -158,11 +157,11 @@ def module_text(sim: SimModel, effects: Sequence[JointEffect], model: str) -> st
     return re.sub(f"^(?:{declared})$", lambda found: values[found[0]], text, flags=re.MULTILINE)
 
 
-def _drives(sim: SimModel, estimate: EffectEstimate | None, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
+def _drives(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
     """Found values of the drives, joint → effect → value."""
     out: dict[str, dict[str, float]] = {}
     for term in terms:
-        if estimate is not None and term.effect in DRIVE:
+        if term.effect in DRIVE:
             value = estimate.parameters(term)[DRIVE[term.effect]].value
             out.setdefault(sim.arm.names[term.place], {})[term.effect] = value
     return out

@@ -56,7 +56,8 @@ CREEPING = 0.01
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as shares of its width."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
-"""Length of a forward simulation from a recorded state, number of them over a recording, largest time step."""
+"""Length of a forward simulation from a recorded state, number of them over a recording, largest time step, also of a
+model whose actuators have delays."""
 AROUND_S = 0.06
 """The state at the start of a simulation is that of a parabola through the readings this close to it [s]."""
 LOST, WILD = np.pi, 50.0

@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.effects.effect import SHORTEST_DELAY
 
 DRIVE = {"actuator.gain": "gain", "actuator.saturation": "limit", "actuator.lag": "time", "actuator.delay": "time"}
 """Effects that a motor holds → their parameter."""
-LEAST_DELAY_S = 0.001
 MOST_SAMPLES, LEAST_STEP_S = 1000, 0.0005
 """A delay is kept by commands, one per step of the simulation: so many at most, and enough for steps this short [s]."""
-LONGEST_STEP_S = 0.002
-"""Step of a simulation whose actuators have delays, at most [s]."""
 
 
 def motors_of(spec: Any) -> dict[str, Any]:
@@ -45,7 +43,7 @@ def put_drive(motor: Any, found: Mapping[str, float]) -> None:
 
 def put_delay(actuator: Any, delay: float) -> None:
     """Let an actuator follow its control so much later [s]; less than a millisecond is none."""
-    if delay >= LEAST_DELAY_S:
+    if delay >= SHORTEST_DELAY:
         actuator.delay = delay
         actuator.nsample = min(MOST_SAMPLES, int(np.ceil(delay / LEAST_STEP_S)) + 2)
 

@@ -130,15 +130,13 @@ LINKS = ("link.", "base.")
 """Effects whose names begin so are of links, which the corrected model has."""
 
 
-def write_motor_entries(sim: SimModel, estimate: EffectEstimate | None, path: Path, step: float = 0.005) -> None:
+def write_motor_entries(sim: SimModel, estimate: EffectEstimate, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput.
 
     Friction, damping and armature are those of the corrected model. A gain of the drive is mjlab's `gear`; Isaac Lab
     has no field for it. What acts in one recording alone is left out.
     """
-    found: dict[tuple[str, int], dict[str, Value]] = {}
-    if estimate is not None:
-        found = {term.key: estimate.parameters(term) for term in estimate.terms if not term.bound}
+    found = {term.key: estimate.parameters(term) for term in estimate.terms if not term.bound}
     model = with_effects(sim, estimate).model
     rows = {name: _entry(model, sim, j, found, step) for j, name in enumerate(sim.arm.names)}
     left = [

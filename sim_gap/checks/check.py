@@ -7,24 +7,22 @@ without a torque channel commands that do not belong to the positions do.
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import SIGNIFICANT
 from sim_gap.checks.column_pairs import follows_position, require_commands, sound_velocity
 from sim_gap.checks.columns import find_wrong_columns
-from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
-from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
+from sim_gap.checks.finding import RecordingFinding, refuse
+from sim_gap.checks.positions import find_beyond_range, find_counts, find_far, find_jumps, find_seam, unwrap
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.sound_arm import motion_of
-from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import CHANNELS, SHORTEST_S, PreparedSignals, prepare
+from sim_gap.residuals.preprocess import CHANNELS, SHORTEST_S, PreparedSignals, at_times, prepare
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
@@ -61,9 +59,7 @@ def times_in_motion(recording: Recording) -> Array:
 def _thinned(recording: Recording) -> tuple[Array, Array]:
     """Even times and the positions there, far enough apart that noise makes no way of its own, (k,) and (k, n)."""
     t = np.arange(recording.t[0], recording.t[-1], WAY_STEP_S)
-    known = [np.isfinite(x) for x in recording.position.T]
-    columns = [np.interp(t, recording.t[k], x[k]) for k, x in zip(known, recording.position.T, strict=True)]
-    return t, np.column_stack(columns)
+    return t, at_times(t, recording.t, recording.position)
 
 
 def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -108,11 +104,9 @@ def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections, known: Collection[str] = ()
 ) -> tuple[Recording, list[RecordingFinding]]:
     """Check and correct one recording, as `check_recordings`; `known` are options that corrected others."""
-    for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
-        raise BadInput(f"{label}: {finding.refusal()}")
+    refuse(label, find_time_unit(recording, stated), find_counts(recording, stated))
     recording, wrapped = unwrap(recording)
-    for finding in find_jumps(recording, stated):
-        raise BadInput(f"{label}: {finding.refusal()}")
+    refuse(label, find_jumps(recording, stated))
     recording, repeated = drop_repeats(recording)
     recording, held = drop_held(recording)
     recording, jitter = even_times(recording, stated)
@@ -127,12 +121,10 @@ def check_recording(
     if not goes_one_way(recording):
         recording, wrong = _with_right_columns(arm, recording, label, stated, known)
         found += wrong
-    beyond = find_beyond_range(arm, recording, stated)
-    if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
-        raise BadInput(f"{label}: {beyond[0].refusal()}")
+    if all(finding.corrected for finding in found):  # else a range is what the doubt is about
+        refuse(label, find_beyond_range(arm, recording, stated))
     recording, velocity = sound_velocity(recording, stated)
-    for finding in find_seam(recording, stated):
-        raise BadInput(f"{label}: {finding.refusal()}")
+    refuse(label, find_seam(recording, stated))
     return recording, [*found, *velocity]
 
 
@@ -183,8 +175,7 @@ velocities and targets are rounded on the bus); least number of such steps."""
 
 def with_gravity(arm: RigidArm, recording: Recording, channels: Sequence[str]) -> Recording:
     """The recording with the model's gravity added to these torque channels."""
-    still = np.zeros_like(recording.position)
-    gravity = arm.torque(recording.position, still, still)
+    gravity = arm.gravity_torque(recording.position)
     made = {CHANNELS[channel]: getattr(recording, CHANNELS[channel]) for channel in channels}
     return replace(recording, **{name: values + gravity for name, values in made.items() if values is not None})
 
@@ -254,13 +245,8 @@ def check_position_only(
                 f"{label}: no torque channel and no commanded position holds a number: record tau_1 …, "
                 "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
             )
-        looks = (
-            find_counts(recording, stated),
-            find_beyond_range(arm, recording, stated),
-            find_far(arm, recording, stated),
-        )
-        for finding in chain(*looks):
-            raise BadInput(f"{label}: {finding.refusal()}")
+        refuse(label, find_counts(recording, stated), find_beyond_range(arm, recording, stated))
+        refuse(label, find_far(arm, recording, stated))
         recording, repeated = drop_repeats(recording)
         recording, jitter = even_times(recording, stated)
         dropped = [] if repeated else find_dropped(recording)

@@ -11,12 +11,12 @@ from itertools import combinations
 import numpy as np
 
 from armlink.recording.corrections import Corrections
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
 from sim_gap.checks.sound_arm import ChannelMotion, likelihood, quick_costs
-from sim_gap.model.rigid_body import RigidArm
 
 CERTAIN_FALL = 5.0 * PRICE
 """Fall of the negative log likelihood from which a correction is certain: as rare an effect as any of the library has
@@ -145,14 +145,17 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of more than two columns, of positions, of torques and of both: exchange after exchange from those that
-    explain most after the one before."""
+    explain most after the one before; none where no exchange explains more than the order as it is recorded."""
     found, few = list[Hypothesis](), motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
     for channels, joints in exchangeable(arm, motion, follows):
         orders = [tuple(range(arm.n))]
         for _ in joints[1:MOST_CANDIDATES]:
             pairs = dict.fromkeys(exchanged(order, pair) for order in orders for pair in combinations(joints, 2))
             trials = [put_in_order(arm, order, channels, motion.channel) for order in pairs]
-            best = np.argsort(-_quick_falls(arm, few, trials))[:MOST_CANDIDATES].tolist()
+            falls = _quick_falls(arm, few, trials)
+            if falls.max() <= 0.0:
+                break
+            best = np.argsort(-falls)[:MOST_CANDIDATES].tolist()
             orders, found = [[*pairs][k] for k in best], [*found, *(trials[k] for k in best)]
     return [each for each in found if len(each.joints) > 2]
 

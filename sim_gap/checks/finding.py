@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from armlink.errors import BadInput
+
 Kind = Literal[
     "order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate", "dropped"
 ]
@@ -37,12 +39,14 @@ class RecordingFinding:
         other = f"option: {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
         return f"{self.evidence_at} – accounted for; {other}"
 
-    def refusal(self) -> str:
-        """For a recording that is not diagnosed until this is settled."""
-        return f"{self.evidence_at} To continue: {self.option}"
-
     def to_json(self) -> dict[str, Any]:
         return dict(vars(self))
+
+
+def refuse(label: str, *found: RecordingFinding | None) -> None:
+    """Raise BadInput for the first of some findings: the recording is not diagnosed until it is settled."""
+    for finding in filter(None, found):
+        raise BadInput(f"{label}: {finding.evidence_at} To continue: {finding.option}")
 
 
 def exchange_option(channel: str, holds: Mapping[int, int]) -> str:

@@ -4,16 +4,16 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import chain, combinations, product
 
 import numpy as np
 
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
 from sim_gap.checks.sound_arm import ChannelMotion, measurements
-from sim_gap.model.rigid_body import RigidArm
 
 DEGREE = math.pi / 180.0
 LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
@@ -27,6 +27,8 @@ ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
 POSITION_CHOICES = 4
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
+STATEMENTS = {"sign": "sign", "unsigned": "sign", "zero": "zero", "scale": "units"}
+"""Statement of the user that settles each kind."""
 LEAST_SIGN_SHARE = 0.1
 """Least share of the rows on either side of zero from which a torque changes its sign."""
 
@@ -52,17 +54,15 @@ def hypotheses(
     arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
 ) -> Iterator[Hypothesis]:
     """Every way in which one column, or all of a channel, may be wrong, less those that the user has settled."""
-    yield from _units(arm, motion, stated)
+    of_columns = chain(_units(arm, motion), _signs(arm, motion, follows), _zeros(arm, motion, follows))
+    for each in of_columns:
+        columns = (f"{each.channels[0]}_{j + 1}" for j in each.joints)
+        if not any(stated.states(STATEMENTS[each.kind], column) for column in columns):
+            yield each
     yield from _sources(arm, motion, stated)
-    yield from _signs(arm, motion, stated, follows)
-    yield from _zeros(arm, motion, stated, follows)
     yield from _delays(arm, motion, stated)
     if not (stated.order or stated.joints):
         yield from _orders(arm, motion, follows)
-
-
-def _settled(stated: Corrections, kind: str, channel: str, joints: Sequence[int]) -> bool:
-    return any(stated.states(kind, f"{channel}_{j + 1}") for j in joints)
 
 
 def _option(kind: str, channels: Sequence[str], value: str, joint: int | None = None) -> str:
@@ -70,70 +70,43 @@ def _option(kind: str, channels: Sequence[str], value: str, joint: int | None = 
     return f"--{kind} " + ",".join(f"{name}{place}={value}" for name in channels)
 
 
-def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+def _signs(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
     channel, every, opposite = motion.channel, tuple(range(arm.n)), "the sign is opposite"
     positions = ("q", *follows)
     for joints in [every, *((j,) for j in every if arm.n > 1)]:
         own = None if len(joints) == arm.n else joints[0]
-        if not _settled(stated, "sign", channel, joints):
-            text = _option("sign", [channel], "-1", own)
-            yield Hypothesis("sign", (channel,), joints, opposite, text, partial(_torques, factor=_sign(arm.n, joints)))
-        if len(joints) == 1 and not _settled(stated, "sign", "q", joints):
-            text = _option("sign", positions, "-1", joints[0])
-            yield Hypothesis(
-                "sign",
-                ("q",),
-                joints,
-                opposite,
-                text,
-                partial(_positions, factor=_sign(arm.n, joints)),
-                POSITION_CHOICES,
-            )
+        text, factor = _option("sign", [channel], "-1", own), _sign(arm.n, joints)
+        yield Hypothesis("sign", (channel,), joints, opposite, text, partial(_torques, factor=factor))
+        if len(joints) == 1:
+            text, change = _option("sign", positions, "-1", joints[0]), partial(_positions, factor=factor)
+            yield Hypothesis("sign", ("q",), joints, opposite, text, change, POSITION_CHOICES)
     model = arm.carried(motion.q, motion.v, motion.a)
     for j in every:
         y, turns = motion.reading[:, j], np.mean(model[:, j] > 0.0)
         one_sided = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
-        if (
-            one_sided
-            and LEAST_SIGN_SHARE < turns < 1.0 - LEAST_SIGN_SHARE
-            and not _settled(stated, "sign", channel, (j,))
-        ):
+        if one_sided and LEAST_SIGN_SHARE < turns < 1.0 - LEAST_SIGN_SHARE:
             option = f"record signed torque, or give --sign {channel}_{j + 1}=1 if this is right"
             what = "the torque never changes its sign, but the torque of the model does"
-            yield Hypothesis(
-                "unsigned", (channel,), (j,), what, option, partial(_signed, arm=arm, joint=j), corrects=False
-            )
+            change = partial(_signed, arm=arm, joint=j)
+            yield Hypothesis("unsigned", (channel,), (j,), what, option, change, corrects=False)
 
 
-def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
     positions, every = ("q", *follows), tuple(range(arm.n))
     far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
-    if far and not _settled(stated, "units", "q", every):
-        yield Hypothesis(
-            "scale",
-            ("q",),
-            every,
-            "the positions are in degrees",
-            _option("units", positions, "deg"),
-            partial(_positions, factor=DEGREE),
-        )
-    for j in every:
-        if _settled(stated, "zero", "q", (j,)):
-            continue
-        for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
-            text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
-            what = f"the zero is off by {angle:+.2f} rad"
-            yield Hypothesis(
-                "zero", ("q",), (j,), what, text, partial(_positions, zero=angle * np.eye(arm.n)[j]), POSITION_CHOICES
-            )
+    if far:
+        text, change = _option("units", positions, "deg"), partial(_positions, factor=DEGREE)
+        yield Hypothesis("scale", ("q",), every, "the positions are in degrees", text, change)
+    for j, angle in product(every, (0.5 * math.pi, -0.5 * math.pi, math.pi)):
+        text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
+        what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
+        yield Hypothesis("zero", ("q",), (j,), what, text, change, POSITION_CHOICES)
 
 
-def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
+def _units(arm: RigidArm, motion: ChannelMotion) -> Iterator[Hypothesis]:
     """A factor in all torques, or in those of one joint."""
     channel, every = motion.channel, tuple(range(arm.n))
     for joints in [every, *((j,) for j in range(arm.n) if arm.n > 1)]:
-        if _settled(stated, "units", channel, joints):
-            continue
         column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
         constant = "N·m/A at the joint" + (", or one for each joint: K1;K2;…" if len(joints) == arm.n > 1 else "")
         option = f"--units {column}=A:K ({constant}), or {column}=N·m if this is right"
@@ -150,22 +123,15 @@ def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Itera
             "the torque contains no gravity, so the program that recorded it has probably subtracted the gravity of "
             "the model"
         )
-        yield Hypothesis(
-            "effort_source", (channel,), every, what, f"--effort-is {WITHOUT_GRAVITY}", partial(_weighed, arm=arm)
-        )
+        change = partial(_weighed, arm=arm)
+        yield Hypothesis("effort_source", (channel,), every, what, f"--effort-is {WITHOUT_GRAVITY}", change)
     if not (motion.rubs or stated.effort) and arm.n > 1:
         what = (
             "the torque contains friction, which a sensor on the link side does not measure, so it is the torque "
             "of the motors"
         )
-        yield Hypothesis(
-            "effort_source",
-            (channel,),
-            every,
-            what,
-            "--effort-is motor",
-            partial(replace, channel="tau_motor", rubs=True),
-        )
+        change = partial(replace, channel="tau_motor", rubs=True)
+        yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", change)
 
 
 def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
@@ -272,8 +238,7 @@ def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:
 
 
 def _weighed(motion: ChannelMotion, arm: RigidArm) -> ChannelMotion:
-    still = np.zeros_like(motion.q)
-    return replace(motion, reading=motion.reading + arm.torque(motion.q, still, still))
+    return replace(motion, reading=motion.reading + arm.gravity_torque(motion.q))
 
 
 def _delayed(motion: ChannelMotion, rows: int) -> ChannelMotion:

@@ -9,6 +9,7 @@ from armlink.recording.corrections import TIME_UNITS, Corrections
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array, Mask
 from sim_gap.checks.finding import RecordingFinding
+from sim_gap.residuals.preprocess import at_times
 
 JITTER = 0.2
 """Standard deviation of the steps over their median from which the times may be those of receipt."""
@@ -28,32 +29,23 @@ CREEP, TRAVEL = 0.02, 0.5
 joint that travels in 53 recordings of real arms reaches twenty times as much."""
 
 
-def find_time_unit(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
+def find_time_unit(recording: Recording, stated: Corrections) -> RecordingFinding | None:
     """Times in milliseconds or less, by which arms that travel would do nothing but creep."""
     if "t" in stated.units or recording.t.size < 50:
-        return []
+        return None
     ahead = 2 * HALF
     far = np.abs(recording.position[ahead:] - recording.position[:-ahead])
     time = recording.t[ahead:] - recording.t[:-ahead]
     travel = float(np.nanmax(np.nanmax(recording.position, axis=0) - np.nanmin(recording.position, axis=0)))
     fastest = float(np.nanmax(far / time[:, None]))
     if travel < TRAVEL or fastest > CREEP:
-        return []
+        return None
     unit = next((unit for unit, seconds in TIME_UNITS.items() if fastest / seconds > CREEP), "ns")
-    what = (
+    evidence = (
         f"the joints travel {travel:.2g} rad in {np.ptp(recording.t):.3g} s, but none is faster than "
-        f"{fastest:.2g} rad/s, which is too slow to be true"
+        f"{fastest:.2g} rad/s, which is too slow to be true: are the times in {unit}?"
     )
-    return [
-        RecordingFinding(
-            "clock",
-            "t",
-            "all",
-            f"{what}: are the times in {unit}?",
-            f"--units t={unit}, or t=s if this is right",
-            False,
-        )
-    ]
+    return RecordingFinding("clock", "t", "all", evidence, f"--units t={unit}, or t=s if this is right", False)
 
 
 def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, list[RecordingFinding]]:
@@ -191,8 +183,8 @@ def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
         return recording, []
     velocity, known = recording.velocity, np.repeat(~same[:, None], recording.n, axis=1)
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
-        velocity = fill(recording.t, velocity, known)
-    position = fill(recording.t, recording.position, known)
+        velocity = at_times(recording.t, recording.t, velocity, known)
+    position = at_times(recording.t, recording.t, recording.position, known)
     evidence = (
         f"the positions repeat in {share:.0%} of the rows in motion while torques change, so they are read less "
         "often; the values between were interpolated"
@@ -204,10 +196,3 @@ def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
 def _repeats(values: Array) -> Mask:
     """Rows in which all columns repeat the row before, (K,)."""
     return np.concatenate([[False], np.all((values[1:] == values[:-1]) | ~np.isfinite(values[1:]), axis=1)])
-
-
-def fill(t: Array, values: Array, known: Mask) -> Array:
-    """Values (K, n), along straight lines between those that are `known` (K, n); columns without any are 0."""
-    return np.column_stack(
-        [np.interp(t, t[k], x[k]) if k.any() else np.zeros_like(t) for k, x in zip(known.T, values.T, strict=True)]
-    )

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gcomp.arm.rigid_body import CREEP, INERTIAL, RigidArm
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms, fold_sums
-from sim_gap.checks.joint_range import beyond_range
-from sim_gap.model.rigid_body import CREEP, INERTIAL, RigidArm
+from sim_gap.checks.positions import beyond_range
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import FOLDS
 
@@ -48,11 +48,15 @@ class ChannelMotion:
     @property
     def telling(self) -> Mask:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
-        return np.asarray(((np.abs(self.v) > CREEP) | (self.channel == "tau")) & np.isfinite(self.reading))
+        return _telling(self.v, self.reading, self.channel == "tau")
 
     def rows(self, rows: slice) -> "ChannelMotion":
         q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
         return replace(self, q=q, v=v, a=a, reading=reading)
+
+
+def _telling(v: Array, reading: Array, of_sensor: Mask | bool) -> Mask:
+    return np.asarray(((np.abs(v) > CREEP) | of_sensor) & np.isfinite(reading))
 
 
 def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
@@ -142,16 +146,16 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
     """Negative log likelihood of each of several motions, by each joint's own effects alone, (M,); model torques
     (M, K, n)."""
     parts = np.array_split(np.arange(len(motions)), -(-len(motions) * models.shape[1] // ROWS_AT_ONCE))
-    costs = [_stacked_costs(arm, models[part], [motions[k] for k in part]) for part in parts]
-    return np.asarray(np.concatenate(costs).sum(1))
+    return np.concatenate([_stacked_costs(arm, models[part], [motions[k] for k in part]) for part in parts])
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    """The same by joint, (M, n)."""
-    q, v, a, read, telling, size, idle, rubs = (
+    """The same, all at once."""
+    q, v, a, read, size, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
-        for name in ("q", "v", "a", "reading", "telling", "size", "idle", "rubs")
+        for name in ("q", "v", "a", "reading", "size", "idle", "rubs")
     )
+    telling = _telling(v, read, np.array([motion.channel == "tau" for motion in motions])[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
     columns, spread = _own_columns(arm, rubs, model, reading, q, v, a)
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
@@ -167,8 +171,8 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     without[..., CARRIED, :], without[..., :, CARRIED] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
-    whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
-    return np.asarray(whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))
+    whole += RANGE_COST * beyond_range(arm, q)
+    return np.asarray((whole - count * np.log(np.maximum(size, SMALLEST_TORQUE))).sum(1))
 
 
 def _model_size(model: Array) -> Array:
@@ -196,12 +200,11 @@ def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Arr
 
 def _own_limits(spread: Array) -> tuple[Array, Array]:
     """Least and largest of each joint's own coefficients, (…, P)."""
-    low, high = np.full(JOINT_EFFECTS, -np.inf), np.full(JOINT_EFFECTS, np.inf)
-    low[-FRICTION_EFFECTS:] = 0.0
-    own = np.broadcast_to(low, spread.shape).copy(), np.broadcast_to(high, spread.shape).copy()
-    for limits, share in zip(own, ERROR_LIMITS["gain"], strict=True):
+    low, high = np.full(spread.shape, -np.inf), np.full(spread.shape, np.inf)
+    low[..., -FRICTION_EFFECTS:] = 0.0
+    for limits, share in zip((low, high), ERROR_LIMITS["gain"], strict=True):
         limits[..., 0] = share / ERROR_STD * spread[..., 0]
-    return own
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,10 +314,10 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
             limits += [(-masses[j], np.inf), *((low, np.inf) for low in least.tolist()), *3 * [(-np.inf, np.inf)]]
         columns += [*own[1:4]]
         spread += 3 * [size]
-    still, weight = np.zeros_like(motion.q), float(np.linalg.norm(arm.gravity))
+    weight = float(np.linalg.norm(arm.gravity))
     if weight > 0.0:
         for axis in np.linalg.svd(arm.gravity[None])[2][1:]:  # across gravity, whose size does not change
-            columns.append(arm.torque(motion.q, still, still, axis).T)
+            columns.append(arm.gravity_torque(motion.q, axis).T)
             spread.append(ERROR_STD * weight)
             limits.append((-np.inf, np.inf))
     return np.array(columns), np.array(spread), np.array(limits).T
@@ -322,9 +325,8 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
 
 def _turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
     """The arm with gravity along the axis that fits best; None without any, or where it hangs as modelled."""
-    still = np.zeros_like(motion.q)
     weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)
-    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+    columns = np.stack([arm.gravity_torque(motion.q, axis) for axis in np.eye(3)], axis=-1)
     weight = motion.telling / (np.nanstd(motion.reading, axis=0) + 1e-9)
     left = (np.nan_to_num(motion.reading - weightless) * weight).ravel()
     gravity = np.linalg.lstsq((columns * weight[:, :, None]).reshape(-1, 3), left, rcond=None)[0]

@@ -195,7 +195,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
     target = path or Path("samples.csv")
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
-    elif answer.internals.estimate is None:
+    elif not answer.internals.estimate.terms:
         console.print("no samples were written, since there is no gap that parameters could explain", style="yellow")
         return
     else:

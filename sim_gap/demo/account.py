@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.text import Text
 
 from armlink.commands.output import write_json
@@ -17,6 +16,7 @@ from calib.report.page import ReportSection as Section
 from calib.report.page import bullets, paragraph, render
 from calib.report.tables import ReportTable, interval_table
 from gcomp.arrays import Array
+from sim_gap.attribution.diagnosis import plain_json
 
 OPENED = "The fit saw only what came over the bus. The true values were opened only after everything was estimated."
 
@@ -50,7 +50,7 @@ class Account:
 
     def note(self, **values: Any) -> None:
         """Add to the summary: numbers with seven digits, null where one is not finite."""
-        self.summary |= _rounded(values)
+        self.summary |= plain_json(values, digits=7)
 
     def write(self, out: Path, subtitle: str) -> None:
         """Write `report.html` and `summary.json`; raises OSError."""
@@ -60,14 +60,3 @@ class Account:
         for path in (out / "summary.json", self._json):
             write_json(path, summary)
         self.say(f"done: open {out / 'report.html'}; the numbers are in {out / 'summary.json'}", console=self._results)
-
-
-def _rounded(value: Any) -> Any:
-    match value:
-        case dict():
-            return {key: _rounded(each) for key, each in value.items()}
-        case list() | tuple() | np.ndarray():
-            return [_rounded(each) for each in value]
-        case float():
-            return float(f"{value:.7g}")
-    return value

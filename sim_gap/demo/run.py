@@ -42,7 +42,7 @@ from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.report import calibration
-from calib.report.figures import verify_figure
+from calib.report.figures import verify_figure, watch_figure
 from calib.report.page import ReportSection, paragraph
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import Verification
@@ -53,7 +53,6 @@ from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
-from sim_gap.report.figures import watch_figure
 from sim_gap.report.page import sections as gap_sections
 
 Made = TypeVar("Made")

@@ -19,6 +19,7 @@ from sim_gap.effects.effect import (
     Shape,
     Signature,
     delay_effect,
+    exceeded_levels,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -49,10 +50,8 @@ def _clipped(command: Array, limit: float, _rate: float) -> Array:
 
 
 def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
-    """Levels that the command exceeds during some of the time [N·m]."""
-    commands = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
-    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
-    return tuple((float(level),) for level in np.quantile(commands, shares))
+    """Levels of the command [N·m]."""
+    return exceeded_levels(np.concatenate([s.reading["tau_cmd"][:, place] for s in signals]))
 
 
 EFFECTS = (
@@ -64,7 +63,7 @@ EFFECTS = (
     ),
     InverseEffect(  # the rotor may have less inertia than the model's armature
         "actuator.rotor_inertia",
-        Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
+        Signature.at_motor(lambda s, j, _: s.a[:, j], "motor", of_motion=True),
         Plausibility(
             every_joint=True,
             # geared drives are matched to their load within a factor of some

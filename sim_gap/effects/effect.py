@@ -31,19 +31,16 @@ class Ratings:
     """How large effects can be at a joint, by its drive, its model and an estimate."""
 
     friction: float
-    """Friction loss of the joint in the model, as far as a motor reads it [N·m]."""
     damping: float
-    """[N·m·s/rad]."""
     armature: float
-    """[kg·m²]."""
+    """Of the joint in the model, as far as a motor reads it [N·m; N·m·s/rad; kg·m²]."""
     speed: float
     """Usual speed (RMS) [rad/s]."""
     torque: float
     """Largest torque that the drive was seen to make, and that the model's links ask of it, together [N·m]."""
     tip_mass: float
-    """Mass of the model's last link [kg]."""
     mass: float
-    """Mass of all its links [kg]."""
+    """Of the model's last link, and of all its links [kg]."""
     dry: float
     """Dry friction of the joint as estimated, `torque` without an estimate [N·m]."""
     own: Array | None = None
@@ -76,6 +73,8 @@ class Signature:
     body: bool = False
     """Whether it is a body that recordings may lack."""
     side: Side = "link"
+    of_motion: bool = False
+    """Whether its columns follow from positions, time and command alone, whatever an estimate finds of torques."""
     moves: Moves | None = None
     """Of an effect that moves the true joint against its reading."""
     offset: Callable[[PreparedSignals, ChannelLayout, Shape], Columns] | None = None
@@ -98,9 +97,16 @@ class Signature:
         return range(1 if self.whole_arm else layout.n)
 
     @classmethod
-    def at_motor(cls, column: Column, channel: Channel = "any", side: Side = "motor") -> "Signature":
+    def at_motor(
+        cls, column: Column, channel: Channel = "any", side: Side = "motor", of_motion: bool = False
+    ) -> "Signature":
         """An effect between motor and torque sensor, of one joint."""
-        return cls(lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))}, channel, side=side)
+        return cls(
+            lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))},
+            channel,
+            side=side,
+            of_motion=of_motion,
+        )
 
     @classmethod
     def at_sensor(cls, column: Column, channel: Channel = "sensor", side: Side = "reading") -> "Signature":
@@ -119,6 +125,7 @@ class Signature:
             lambda s, layout, j, shape: {(str(layout.commanded), j): _2d(column(s, j, shape))},
             "command",
             side="command",
+            of_motion=True,
         )
 
 
@@ -204,6 +211,12 @@ CLIPPED = 0.2
 """Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
 NEAR_ONE = (0.6, 1.6)
 """Bounds of such a coefficient."""
+
+
+def exceeded_levels(values: Array) -> tuple[Shape, ...]:
+    """Levels that a signal (K,) exceeds during some of the time, to start with."""
+    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
+    return tuple((float(level),) for level in np.quantile(np.abs(values), shares))
 
 
 def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:

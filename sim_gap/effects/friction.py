@@ -82,17 +82,17 @@ def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
 EFFECTS = (
     InverseEffect(
         "friction.coulomb",
-        Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
+        Signature.at_motor(lambda s, joint, _: s.direction[:, joint], of_motion=True),
         Plausibility(every_joint=True, background_std=0.03, background_nm=True, bounds=_dry_above_nominal),
     ),
     InverseEffect(
         "friction.viscous",
-        Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
+        Signature.at_motor(lambda s, joint, _: s.v[:, joint], of_motion=True),
         Plausibility(every_joint=True, background_std=0.02, background_nm=True, bounds=_viscous_above_nominal),
     ),
     InverseEffect(
         "friction.stribeck",
-        Signature.at_motor(_stribeck),
+        Signature.at_motor(_stribeck, of_motion=True),
         Plausibility(bounds=lambda ratings, _shape: (0.0, ratings.torque)),
         SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
         needs=COULOMB,
@@ -100,7 +100,7 @@ EFFECTS = (
     ),
     InverseEffect(
         "friction.asymmetric",
-        Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
+        Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint]), of_motion=True),
         Plausibility(bounds=lambda ratings, _shape: (-ratings.dry, ratings.dry)),
         needs=COULOMB,
         parameters_of=_ratio,

@@ -1,64 +1,23 @@
-"""Links whose masses differ from the model: they show at every joint from the base to that link."""
+"""Links whose masses differ from the model, at every joint from the base to that link; a base that is tilted."""
 
 from collections.abc import Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
 
-from gcomp.arm.inertials import SIX
+from gcomp.arm.inertials import LIGHT_KG, moment_to_inertia, point_slopes
+from gcomp.arm.rigid_body import POSITION_STEP, turned
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, Ratings, SearchHints, Shape, Signature
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 
-LIGHT_KG = 1e-6
-"""Least absolute mass of which a centre is taken [kg]."""
-
-
-def point_mass(mass: float, moment: Array) -> Array:
-    """Ten parameters of a point mass (negative if it is taken away) from its mass and first moment."""
-    centre = moment / mass if abs(mass) > LIGHT_KG else np.zeros(3)
-    inertia = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return np.concatenate([[mass], moment, inertia[SIX]])
-
-
-def point_slopes(mass: float, moment: Array) -> Array:
-    """Derivative of `point_mass` in mass and moment, (10, 4); of its first four rows alone without a mass."""
-    out = np.vstack([np.eye(4), np.zeros((6, 4))])
-    if abs(mass) > LIGHT_KG:
-        centre = moment / mass
-        out[4:, 0] = -(centre @ centre * np.eye(3) - np.outer(centre, centre))[SIX]
-        out[4:, 1:] = moment_to_inertia(centre)
-    return out
-
 
 def mount_matrix(axis: Array, angle: float) -> Array:
     """Mass and first moment of a body that is turned about an axis (3,) by an angle, from those before, (4, 4)."""
-    x, y, z = axis
-    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     out = np.eye(4)
-    out[1:, 1:] += np.sin(angle) * hat + (1.0 - np.cos(angle)) * hat @ hat
+    out[1:, 1:] = turned(np.eye(3), axis, angle)
     return out
-
-
-def moment_to_inertia(centre: Array) -> Array:
-    """Change of the inertia about the joint with the first moment of a body with its centre of mass there, (6, 3).
-
-    I = Σ m (|r|² 1 − r rᵀ), so moving mass at c by δ adds 2 (c·mδ) 1 − (c mδᵀ + mδ cᵀ), to first order.
-    """
-    out = np.empty((6, 3))
-    for k, unit in enumerate(np.eye(3)):
-        change = 2.0 * centre @ unit * np.eye(3) - np.outer(centre, unit) - np.outer(unit, centre)
-        out[:, k] = change[SIX]
-    return out
-
-
-def move_mass(inertial: Array, moment: Array) -> Array:
-    """A link whose first moment is larger by `moment` (3,): its centre moves, mass and inertia about it stay, (10,)."""
-    mass = max(float(inertial[0]), 1e-9)
-    old, new = inertial[1:4] / mass, (inertial[1:4] + moment) / mass
-    change = mass * (new @ new - old @ old) * np.eye(3) - mass * (np.outer(new, new) - np.outer(old, old))
-    return np.concatenate([inertial[:1], inertial[1:4] + moment, inertial[4:] + change[SIX]])
 
 
 LEVER = 0.15
@@ -75,7 +34,7 @@ FARTHEST = 0.6
 """Largest distance of a payload's centre of mass from the last joint [m]."""
 
 
-def _rows(signals: PreparedSignals, layout: ChannelLayout, link: int, columns: Array) -> Columns:
+def link_rows(signals: PreparedSignals, layout: ChannelLayout, link: int, columns: Array) -> Columns:
     """Columns (K, n, p) at every joint that carries the link."""
     carrying = np.flatnonzero(signals.arm.carries[:, link])
     return {(layout.against_model, int(joint)): columns[:, joint] for joint in carrying}
@@ -90,12 +49,12 @@ def _mass_moment(signals: PreparedSignals, layout: ChannelLayout, place: int, _s
     centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
     moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(centre)
     shows = np.mean(moved**2, axis=(0, 1)) > SHOWS**2 * np.mean(along**2, axis=(0, 1))
-    return _rows(signals, layout, place, (moved + along) * shows)
+    return link_rows(signals, layout, place, (moved + along) * shows)
 
 
 def _inertia(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
     """An error of a link's inertia about its joint."""
-    return _rows(signals, layout, place, signals.link_regressor(place)[..., 4:])
+    return link_rows(signals, layout, place, signals.link_regressor(place)[..., 4:])
 
 
 def _payload(signals: PreparedSignals, layout: ChannelLayout, _place: int, shape: Shape) -> Columns:
@@ -104,7 +63,9 @@ def _payload(signals: PreparedSignals, layout: ChannelLayout, _place: int, shape
     If only some of the recordings were made with it, the shape holds their numbers as bits, the first as 1.
     """
     tip = signals.n - 1
-    return _rows(signals, layout, tip, signals.link_regressor(tip)[..., :4] @ _mount(signals) * _has(signals, shape))
+    return link_rows(
+        signals, layout, tip, signals.link_regressor(tip)[..., :4] @ _mount(signals) * _has(signals, shape)
+    )
 
 
 def _payload_slopes(signals: PreparedSignals, layout: ChannelLayout, shape: Shape, c: Array) -> Columns:
@@ -112,7 +73,7 @@ def _payload_slopes(signals: PreparedSignals, layout: ChannelLayout, shape: Shap
     tip, mount = signals.n - 1, _mount(signals)
     here = mount @ c
     slopes = signals.link_regressor(tip) @ (point_slopes(float(here[0]), here[1:]) @ mount)
-    return _rows(signals, layout, tip, slopes * _has(signals, shape))
+    return link_rows(signals, layout, tip, slopes * _has(signals, shape))
 
 
 def _mount(signals: PreparedSignals) -> Array:
@@ -145,10 +106,6 @@ def _recordings(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape,
     return ((), *(shape_of(each) for size in sizes for each in combinations(known, size)))
 
 
-def _tip_mass_moment(layout: ChannelLayout, _place: int) -> tuple[Key, ...]:
-    return (("link.mass_moment", layout.n - 1),)
-
-
 def _all_mass_moments(layout: ChannelLayout, _place: int, _shape: Shape) -> tuple[Key, ...]:
     return tuple(("link.mass_moment", link) for link in range(layout.n))
 
@@ -162,12 +119,85 @@ def _near_the_tip(ratings: Ratings, _shape: Shape) -> tuple[Array, Array]:
 
 def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
     mass = float(coefficients[0])
-    return np.concatenate([[mass], coefficients[1:] / (mass if abs(mass) > 1e-6 else np.inf)])
+    return np.concatenate([[mass], coefficients[1:] / (mass if abs(mass) > LIGHT_KG else np.inf)])
 
 
 def _mass(signals: PreparedSignals, link: int) -> float:
     """Mass of a link [kg], as a scale of the plausible error of its inertials."""
     return max(float(signals.arm.inertial[link, 0]), LIGHTEST)
+
+
+# ---- a base that is tilted against the model: gravity comes from another direction
+
+TILT_DEVIATION = 1.0
+"""Prior standard deviation of an angle of the tilt [rad]: a base may stand on a wall."""
+LARGE = 0.3
+"""Tilt from which the search also starts [rad]."""
+
+
+def axes_across(gravity: Array) -> Array:
+    """The two base axes closest to perpendicular to gravity, (2, 3)."""
+    order = np.sort(np.argsort(np.abs(gravity), kind="stable")[:2])
+    return np.eye(3)[order]
+
+
+def tilt_gravity(gravity: Array, angles: Array) -> Array:
+    """Gravity in the frame of a base that is rotated by a rotation vector about two axes across gravity, (3,).
+
+    The vector has the two angles [rad] as its components; gravity rotates the other way (Rodrigues).
+    """
+    turn = -np.asarray(angles, float) @ axes_across(gravity)
+    angle = float(np.linalg.norm(turn))
+    return np.asarray(turned(np.eye(3), turn / max(angle, 1e-12), angle) @ gravity)
+
+
+def _slopes(gravity: Array, angles: Array) -> Array:
+    """Derivative of `tilt_gravity` in the two angles, (3, 2)."""
+    steps = POSITION_STEP * np.eye(2)
+    return np.stack([tilt_gravity(gravity, angles + d) - tilt_gravity(gravity, angles - d) for d in steps], axis=-1) / (
+        2 * POSITION_STEP
+    )
+
+
+def _tilt(signals: PreparedSignals, layout: ChannelLayout, _place: int, shape: Shape) -> Columns:
+    """The base rotated about two axes across gravity (its x and y if gravity is along z), linearised at `shape`."""
+    columns = np.asarray(signals.gravity_columns @ _slopes(signals.read.arm.gravity, np.array(shape or (0.0, 0.0))))
+    return {(layout.against_model, joint): columns[:, joint] for joint in range(signals.n)}
+
+
+def _beside(signals: PreparedSignals, layout: ChannelLayout, shape: Shape) -> Columns:
+    """Part of a large tilt that its columns lack."""
+    nominal, angles = signals.read.arm.gravity, np.array(shape or (0.0, 0.0))
+    rest = tilt_gravity(nominal, angles) - nominal - _slopes(nominal, angles) @ angles
+    return {(layout.against_model, joint): signals.gravity_columns[:, joint] @ rest for joint in range(signals.n)}
+
+
+def _starts(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...]:
+    """No tilt, and the direction that a free fit of gravity finds, if that is far from the model's."""
+    nominal = signals[0].arm.gravity
+    gram, side = 1e-9 * np.eye(3), np.zeros(3)
+    for s in signals:
+        channel = "tau" if "tau" in s.reading else s.channels[0]
+        for joint in range(s.n):
+            moved = np.column_stack([np.ones(len(s.t)), s.direction[:, joint], s.v[:, joint]])
+            columns = np.column_stack([s.gravity_columns[:, joint], s.reading[channel][:, joint] - s.model[:, joint]])
+            x = columns - moved @ np.linalg.lstsq(moved, columns, rcond=None)[0]
+            gram, side = gram + x[:, :3].T @ x[:, :3], side + x[:, :3].T @ x[:, 3]
+    found = nominal + np.linalg.lstsq(gram, side, rcond=1e-6)[0]
+    angles = angles_of(nominal, found)
+    flat: Shape = (0.0, 0.0)
+    return (flat, (float(angles[0]), float(angles[1]))) if np.linalg.norm(angles) > LARGE else (flat,)
+
+
+def angles_of(nominal: Array, found: Array) -> Array:
+    """The two angles at which `tilt_gravity` turns the direction of gravity to that of `found` [rad], (2,)."""
+    length = float(np.linalg.norm(nominal) * np.linalg.norm(found))
+    if length < 1e-12:
+        return np.zeros(2)
+    cross, cosine = np.cross(found, nominal) / length, float(np.clip(nominal @ found / length, -1.0, 1.0))
+    axis = axes_across(nominal) @ cross
+    size = float(np.linalg.norm(axis))
+    return np.asarray(np.arccos(cosine) * (axis / size if size > 1e-9 else np.array([1.0, 0.0])))
 
 
 EFFECTS = (
@@ -186,8 +216,17 @@ EFFECTS = (
         Signature(_payload, whole_arm=True, recordings=recording_numbers, body=True, slopes=_payload_slopes),
         Plausibility(prior_penalty=0, prior_std=np.array([20.0, 4.0, 4.0, 4.0]), bounds=_near_the_tip),
         SearchHints(
-            shapes_for=_recordings, discrete=frozenset({0}), covers=_tip_mass_moment, alternatives=_all_mass_moments
+            shapes_for=_recordings,
+            discrete=frozenset({0}),
+            covers=lambda layout, _: (("link.mass_moment", layout.n - 1),),
+            alternatives=_all_mass_moments,
         ),
         parameters_of=_mass_and_centre,
+    ),
+    InverseEffect(
+        "base.tilt",
+        Signature(_tilt, whole_arm=True, offset=_beside),
+        Plausibility(prior_std=TILT_DEVIATION),
+        SearchHints(shapes_for=_starts, linearised_at=0, relinearise=lambda c, _shape: (float(c[0]), float(c[1]))),
     ),
 )

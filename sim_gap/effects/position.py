@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gcomp.arm.rigid_body import POSITION_STEP
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     Beneath,
@@ -21,8 +22,6 @@ from sim_gap.effects.effect import (
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
-LEAST_SECANT = 1e-4
-"""Coefficient, in its own unit, from which its response is a secant; below, it is the derivative."""
 PART_OF_TURN = 2.0
 """Range [rad] from which an error with a period of one turn can be separated from a gain."""
 WORST_GAIN, WORST_ECCENTRICITY = 0.15, 0.2
@@ -35,9 +34,9 @@ Error = Callable[[Array], tuple[Array, ...]]
 def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves: Array, size: float = 0.0) -> Columns:
     """Change of the model torque per unit of each coefficient that moves a joint: (K, p, 3) → (K, p) by row.
 
-    The secant over `size` of the first coefficient, or the derivative if that is zero.
+    The secant over `size` of the first coefficient, or the derivative if that is no larger than a difference's step.
     """
-    if abs(size) > LEAST_SECANT:
+    if abs(size) > POSITION_STEP:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects import base, drive, friction, link, position, torque, transmission
+from sim_gap.effects import drive, friction, link, position, torque, transmission
 from sim_gap.effects.effect import InverseEffect, Plausibility, Shape, Signature
+from sim_gap.effects.link import link_rows
 from sim_gap.effects.position import position_effect, reading_moves
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -58,9 +59,7 @@ def _smooth_in_velocity(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
 
 def _body(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
     """The ten inertial parameters of a body fixed to a link."""
-    carrying = np.flatnonzero(signals.arm.carries[:, place])
-    columns = signals.link_regressor(place)
-    return {(layout.against_model, int(j)): columns[:, j] for j in carrying}
+    return link_rows(signals, layout, place, signals.link_regressor(place))
 
 
 def _gravity(signals: PreparedSignals, layout: ChannelLayout, _place: int, _shape: Shape) -> Columns:
@@ -145,7 +144,7 @@ LAWS = {law.id: law for law in _LAWS}
 """All laws by id."""
 
 
-FAMILIES = (friction, link, base, position, torque, transmission, drive)
+FAMILIES = (friction, link, position, torque, transmission, drive)
 """Modules with an `EFFECTS`; effects are searched in this order."""
 NOT_DIAGNOSED = {"torque.nonlinearity": "reported only as the general law `law.load`, never as a cause"}
 """Catalogue ids without an inverse form, and why."""

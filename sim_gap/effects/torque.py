@@ -17,27 +17,26 @@ from sim_gap.effects.effect import (
     Shape,
     Signature,
     delay_effect,
+    exceeded_levels,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
-PLAY_HZ = 50.0
-"""Rate at which a play operator is evaluated [Hz]; smooth torques change little from one sample to the next."""
 
 
-def largest_torque(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
-    """Quantile of a joint's absolute model torque [N·m]."""
-    return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), share))
+def largest_torque(signals: Sequence[PreparedSignals], joint: int) -> float:
+    """Largest absolute model torque of a joint but for a fiftieth of the time [N·m]."""
+    return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), 0.98))
 
 
 def _other_joints(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     return tuple((float(source + 1),) for source in range(signals[0].n) if source != place)
 
 
-def _distorted(distort: Callable[[Array, Shape, float], Array]) -> Signature:
-    """Reading less true torque, `distort(torque (K,), shape, rate)`; the shape begins with a level."""
-    return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape, s.rate), side="distortion")
+def _distorted(distort: Callable[[Array, Shape], Array]) -> Signature:
+    """Reading less true torque, `distort(torque (K,), shape)`; the shape begins with a level."""
+    return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape), side="distortion")
 
 
 def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]:
@@ -45,16 +44,15 @@ def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[
     return lambda signals, place: tuple((share * largest_torque(signals, place),) for share in shares)
 
 
-def _exceeded(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
-    """Levels that the torque exceeds during some of the time [N·m]."""
-    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
-    return tuple((largest_torque(signals, place, share),) for share in shares)
+def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
+    """Levels of the torque [N·m]."""
+    return exceeded_levels(np.concatenate([s.model[:, place] for s in signals]))
 
 
-def _stays_behind(torque: Array, shape: Shape, rate: float) -> Array:
+def _stays_behind(torque: Array, shape: Shape) -> Array:
     """Reading less true torque with hysteresis: one play, or if the shape says so several of growing width."""
     shares = GRADUAL if is_gradual(shape) else (1.0,)
-    return np.asarray(np.mean([play(torque, share * shape[0], rate) for share in shares], axis=0) - torque)
+    return np.asarray(np.mean([play(torque, share * shape[0]) for share in shares], axis=0) - torque)
 
 
 def is_gradual(shape: Shape) -> bool:
@@ -66,19 +64,16 @@ def _abrupt_and_gradual(shape: Shape) -> tuple[Shape, ...]:
     return (shape[:1], (shape[0], float(len(GRADUAL))))
 
 
-def play(x: Array, half: float, rate: float) -> Array:
+def play(x: Array, half: float) -> Array:
     """Output of a play (backlash operator) of half width `half` that starts in its middle, (K,)."""
-    step = max(1, int(rate / PLAY_HZ))
-    coarse = x[::step]
-    steps = np.diff(coarse)
-    turns = np.concatenate([[0], 1 + np.flatnonzero(steps[1:] * steps[:-1] <= 0.0), [len(coarse) - 1]])
-    at, before = float(coarse[0]), []
-    for value in coarse[turns[1:]].tolist():  # within a run in one direction the output follows from its start
+    steps = np.diff(x)
+    turns = np.concatenate([[0], 1 + np.flatnonzero(steps[1:] * steps[:-1] <= 0.0), [len(x) - 1]])
+    at, before = float(x[0]), []
+    for value in x[turns[1:]].tolist():  # within a run in one direction the output follows from its start
         before.append(at)
         at = min(max(at, value - half), value + half)
-    start = np.concatenate([coarse[:1], np.repeat(before, np.diff(turns))])
-    out = np.clip(start, coarse - half, coarse + half)
-    return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
+    start = np.concatenate([x[:1], np.repeat(before, np.diff(turns))])
+    return np.asarray(np.clip(start, x - half, x + half))
 
 
 def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
@@ -120,16 +115,16 @@ EFFECTS = (
     ),
     InverseEffect(  # the width is what is lost beyond the band
         "torque.deadband",
-        _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
+        _distorted(lambda torque, shape: -np.clip(torque, -shape[0], shape[0])),
         CUT_OFF,
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
         parameters_of=lambda c, shape, _: c * shape[0],
     ),
     InverseEffect(
         "torque.saturation",
-        _distorted(lambda torque, shape, _rate: np.clip(torque, -shape[0], shape[0]) - torque),
+        _distorted(lambda torque, shape: np.clip(torque, -shape[0], shape[0]) - torque),
         CUT_OFF,
-        SearchHints(shapes_for=_exceeded),
+        SearchHints(shapes_for=_levels),
         parameters_of=lambda _, shape, _beneath: [shape[0]],
     ),
     delay_effect("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gcomp.arm.rigid_body import CREEP
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     Beneath,
@@ -19,7 +20,6 @@ from sim_gap.effects.effect import (
     Signature,
 )
 from sim_gap.effects.position import position_effect
-from sim_gap.model.rigid_body import CREEP
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -114,7 +114,7 @@ def _play(signals: PreparedSignals, layout: ChannelLayout, place: int) -> Array:
 EFFECTS = (
     InverseEffect(
         "transmission.ripple",
-        Signature.at_motor(_ripple),
+        Signature.at_motor(_ripple, of_motion=True),
         hints=SearchHints(shapes_for=_cycles),
         parameters_of=lambda c, shape, _: [np.hypot(*c), shape[0], np.arctan2(c[1], c[0])],
     ),
@@ -126,7 +126,7 @@ EFFECTS = (
     ),
     InverseEffect(
         "transmission.coupling",
-        Signature(_coupling, side="motor"),
+        Signature(_coupling, side="motor", of_motion=True),
         Plausibility(bounds=(0.0, np.inf)),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=lambda c, shape, _: [shape[1], shape[0], *c],

@@ -11,10 +11,10 @@ import numpy as np
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
-from gcomp.arm.inertials import inertial_of
+from gcomp.arm.inertials import fixed_body_parameters
 from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
+from gcomp.arm.rigid_body import RigidArm, Tendons
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import RigidArm, Tendons
 from sim_gap.model.solver_friction import creep_speeds
 
 
@@ -186,16 +186,20 @@ class SimModel:
 
 
 def load_model(
-    source: Any, names: tuple[str, ...] = (), count: int | None = None, known: Mapping[str, int] | None = None
+    source: Any,
+    names: tuple[str, ...] = (),
+    count: int | None = None,
+    known: Mapping[str, int] | None = None,
+    path: Path | None = None,
 ) -> SimModel:
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
     `names` are the recording's joint names if it has any; `count` is its number of joints; `known` are the hinges that
     may be the arm's, with their ids (`hinges_between`), by default all. Joints are matched by name if the model has all
-    of them, else in order; if there are too many, those of a hand and coupled ones are locked. Raises BadInput if the
-    model cannot be read or does not fit.
+    of them, else in order; if there are too many, those of a hand and coupled ones are locked. `path` is the file of a
+    compiled model. Raises BadInput if the model cannot be read or does not fit.
     """
-    path = Path(source) if isinstance(source, str | Path) else None
+    path = Path(source) if isinstance(source, str | Path) else path
     model = load_compiled(source)
     known = hinges_of(model) if known is None else dict(known)
     hinges = list(known.values())
@@ -227,15 +231,17 @@ def load_model(
 
 def with_gains(sim: SimModel, gains: KnownGains) -> SimModel:
     """The model with position controllers of these gains at its joints. Raises BadInput for a model without a file."""
-    if sim.path is None:
-        raise BadInput("--gains needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     sim = replace(sim, gains=gains.of_joints(sim.n))
     return replace(sim, mujoco_model=named_spec(sim).compile())
 
 
 def named_spec(sim: SimModel) -> Any:
-    """The nominal model's file as a `mujoco.MjSpec`, with the stated gains, its elements numbered and joints named."""
-    assert sim.path is not None
+    """The nominal model's file as a `mujoco.MjSpec`, with the stated gains, its elements numbered and joints named.
+
+    Raises BadInput if the model did not come from a file.
+    """
+    if sim.path is None:
+        raise BadInput("this needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     spec = read_spec(sim.path)
     spec.compile()
     for name, joint in zip(sim.arm.names, sim.joints, strict=True):
@@ -289,20 +295,15 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
     frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
 
     def carrier(body: int) -> int:
-        while body and body not in link_of_body:
-            body = int(model.body_parentid[body])
-        return link_of_body.get(body, -1)
+        return next((link_of_body[each] for each in upwards(model, body) if each in link_of_body), -1)
 
     parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
     inertial = np.zeros((len(joints), 10))
     for body in range(1, model.nbody):
         link = carrier(body)
         if link >= 0:
-            turn, origin = frames[link]
-            spin = turn.T @ data.ximat[body].reshape(3, 3)
-            centre = turn.T @ (data.xipos[body] - origin)
-            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
-            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
+            own = int(model.jnt_bodyid[joints[link]])
+            inertial[link] += fixed_body_parameters(model, data, body, own, model.jnt_pos[joints[link]])
     ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
     dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
     return RigidArm(

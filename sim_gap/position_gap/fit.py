@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, linearise
 from gcomp.estimate.solve import solve
-from sim_gap.model.rigid_body import RigidArm
 from sim_gap.position_gap.parameters import (
     EFFECTS,
     INVERSE,

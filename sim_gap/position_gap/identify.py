@@ -15,16 +15,16 @@ from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import (
     QUIET,
     About,
+    Stage,
     groups_of,
     look_about,
     scale_left,
     select,
+    stages,
     without_group,
     worth,
 )
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
-from sim_gap.position_gap.judge import Stage, stages
-from sim_gap.position_gap.parameters import shared_effects
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
 from sim_gap.position_gap.start import limited_servo_start, noise_floor, scales_of, starting_fit
@@ -229,8 +229,3 @@ def _margin(search: LoopSearch, fit: LoopFit) -> Array:
     torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
     matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)
     return np.asarray(np.maximum(2.0 * search.floor, matters))
-
-
-def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:
-    """Names of the fitted columns of an effect of the whole arm."""
-    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.at(-1))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import RigidArm
 
 
 @dataclass(frozen=True)

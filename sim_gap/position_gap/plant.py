@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcomp.arm.inertials import body_parameters, set_body
-from gcomp.arm.model_file import linear_part
+from gcomp.arm.inertials import body_parameters, point_mass, set_body
+from gcomp.arm.model_file import carried_bodies, linear_part
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.native_drives import resting_command
-from sim_gap.effects.base import tilt_gravity
-from sim_gap.effects.link import point_mass
+from sim_gap.effects.link import tilt_gravity
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import creep_speeds, solver_parameters
 from sim_gap.position_gap.parameters import PARAMETERS
@@ -117,10 +116,7 @@ def held_model(sim: SimModel) -> Any:
     model = copy(sim.mujoco_model)
     dofs = model.jnt_dofadr[list(sim.joints)]
     others = np.setdiff1d(np.arange(model.nv), dofs)
-    moves = {int(model.jnt_bodyid[joint]) for joint in sim.joints}
-    for body in range(1, model.nbody):
-        if int(model.body_parentid[body]) in moves:
-            moves.add(body)
+    moves = carried_bodies(model, model.jnt_bodyid[list(sim.joints)])
     if not len(others):
         return model
     model.dof_armature[others] = LOCKED
@@ -129,7 +125,7 @@ def held_model(sim: SimModel) -> Any:
         joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         if not joint or int(model.actuator_trnid[i, 0]) not in sim.joints:
             model.actuator_gainprm[i], model.actuator_biasprm[i] = 0.0, 0.0
-    outside = ~np.isin(model.geom_bodyid, sorted(moves))
+    outside = ~np.isin(model.geom_bodyid, moves)
     model.geom_contype[outside], model.geom_conaffinity[outside] = 0, 0
     refresh(model)
     return model
@@ -282,11 +278,7 @@ class MovedModel:
 
     def carried(self) -> list[int]:
         """Bodies that the arm's joints carry."""
-        up, out = self.model.body_parentid, set(self.bodies.tolist())
-        for body in range(1, self.model.nbody):
-            if int(up[body]) in out:
-                out.add(body)
-        return sorted(out)
+        return carried_bodies(self.model, self.bodies)
 
     def _change_links(self, model: Any, point: Point) -> None:
         for link in range(self.n):

@@ -147,7 +147,7 @@ class World:
         ki = np.maximum(self.point["ki"], 1e-9)
         q = self.data.first[:, self.w]
         error = self.earlier - q
-        asked = self.plant.sim.arm.torque(q[None], 0 * q[None], 0 * q[None])[0]
+        asked = self.plant.sim.arm.gravity_torque(q[None])[0]
         return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 
 

@@ -42,15 +42,20 @@ class SoundGap:
     """Whether a sound arm may have these errors, and they leave nothing that matters."""
 
 
+def omitted_of(search: LoopSearch) -> dict[str, Array]:
+    """Standard deviation of what sound arms have and models leave out: friction [N·m] and lateness [s], (J,) each."""
+    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
+    return {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
+
+
 def errors_of(search: LoopSearch) -> dict[Place, float]:
     """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
-    nominal, scales = search.nominal, search.scales
-    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
+    nominal, scales, omitted = search.nominal, search.scales, omitted_of(search)
     deviation = {
         "viscous": ERROR * nominal["viscous"],
-        "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
+        "coulomb": np.hypot(ERROR * nominal["coulomb"], omitted["coulomb"]),
         "armature": ERROR * scales.inertia,
-        "delay": np.full_like(friction, np.hypot(LATE_S, APART_S)),
+        "delay": omitted["delay"],
     }
     out: dict[Place, float] = {}
     for j in range(search.data.joints):

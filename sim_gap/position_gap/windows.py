@@ -4,7 +4,7 @@ A recording ends where rows are missing or a position makes a step that no motio
 that begins afresh, as the short roll-outs of a data set do.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -17,7 +17,7 @@ from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.plant import MovedModel, Piece
-from sim_gap.residuals.preprocess import low_pass
+from sim_gap.residuals.preprocess import at_times, low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0
 """Judged length of a window, and the simulated time before it that is not judged [s]; a piece that is not as long as a
@@ -102,11 +102,6 @@ def period_of(recording: Recording) -> float:
     return float(np.median(np.diff(recording.t)))
 
 
-def smoothing(period: float) -> Callable[[Array], Array]:
-    """The low pass of motion that was recorded every `period` [s]."""
-    return low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)
-
-
 def pieces_of(recording: Recording) -> list[slice]:
     """Rows of the parts of a recording without a gap or a step that no motion makes."""
     t, period = recording.t, period_of(recording)
@@ -129,8 +124,8 @@ def pieces_of(recording: Recording) -> list[slice]:
 def windows_of(
     plant: MovedModel, recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
 ) -> Windows:
-    """Cut recordings into windows, the same however they are ordered. Raises BadInput for one that holds no commanded
-    position.
+    """Cut recordings with commands into windows, the same however they are ordered. Raises BadInput if none is long
+    enough.
 
     `scales` are the controller's gains in each recording relative to the first, by default 1.
     """
@@ -139,11 +134,6 @@ def windows_of(
     parts: list[dict[str, Any]] = []
     for number in _in_one_order(recordings):
         recording = recordings[number]
-        if recording.position_command is None or not np.isfinite(recording.position_command).any():
-            raise BadInput(
-                f"{labels[number]}: there is neither a torque channel nor a commanded position: record tau_1 "
-                "… or q_cmd_1 …"
-            )
         for rows in pieces_of(recording):
             part = slice_rows(recording, rows)
             if np.isfinite(part.position).all(axis=1).sum() < BEGINNING_ROWS:
@@ -177,12 +167,9 @@ def _padded(given: Any, longest: int, name: str) -> Array:
     return np.concatenate([values, 0.0 * more if name == "weight" else more])
 
 
-def _piece(sim: SimModel, part: Recording, start: Array, velocity: Array) -> Piece:
-    """The commands of a part that begins with these positions and velocities, (n,) each."""
-    given = part.position_command
-    assert given is not None
-    served = np.isfinite(given)
-    filled = given.copy()
+def _piece(sim: SimModel, part: Recording, given: Array, start: Array, velocity: Array) -> Piece:
+    """The commands (K, n) of a part that begins with these positions and velocities, (n,) each."""
+    served, filled = np.isfinite(given), given.copy()
     for j in range(filled.shape[1]):
         there = served[:, j]
         order = np.maximum.accumulate(np.where(there, np.arange(len(there)), 0))
@@ -190,7 +177,7 @@ def _piece(sim: SimModel, part: Recording, start: Array, velocity: Array) -> Pie
         filled[: int(np.argmax(there)), j] = filled[int(np.argmax(there)), j]
     ends = np.append(part.t, part.t[-1] + period_of(part)) - part.t[0]
     area = np.vstack([np.zeros((1, filled.shape[1])), np.cumsum(filled * np.diff(ends)[:, None], axis=0)])
-    asked = sim.arm.torque(start[None], 0.0 * start[None], 0.0 * start[None])[0] + sim.arm.spring_torque(start[None])[0]
+    asked = sim.arm.gravity_torque(start[None])[0] + sim.arm.spring_torque(start)
     return Piece(ends, area, served, start, asked, served[0] & (velocity == 0.0))
 
 
@@ -198,9 +185,7 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
     """One piece and its windows."""
     t, q = part.t - part.t[0], part.position
     seen = np.isfinite(q)
-    filled = np.column_stack(
-        [np.interp(t, t[s], x[s]) if s.any() else 0.0 * t for x, s in zip(q.T, seen.T, strict=True)]
-    )
+    filled = at_times(t, t, q)
     noise = _noise(filled)
     q0, v0 = _beginning(t, filled, noise)
     smooth, v, a = _smoothed(t, filled)
@@ -241,7 +226,7 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
             }
         )
         begin = t[first] + WINDOW_S
-    return _piece(sim, part, q0, v0), out
+    return _piece(sim, part, given, q0, v0), out
 
 
 def _noise(q: Array) -> Array:
@@ -256,11 +241,12 @@ def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:
     """Smoothed position, velocity and acceleration at the rows, (K, n) each."""
     period = float(np.median(np.diff(t)))
     even = np.arange(0.0, t[-1] + 0.5 * period, period)
-    raw = np.column_stack([np.interp(even, t, x) for x in q.T])
-    smooth = smoothing(period)(raw) if len(even) > 3 * BEGINNING_ROWS else raw
+    raw = at_times(even, t, q)
+    smoothed = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)
+    smooth = smoothed(raw) if len(even) > 3 * BEGINNING_ROWS else raw
     v = np.gradient(smooth, period, axis=0)
     a = np.gradient(v, period, axis=0)
-    return tuple(np.column_stack([np.interp(t, even, x) for x in y.T]) for y in (smooth, v, a))  # type: ignore[return-value]
+    return at_times(t, even, smooth), at_times(t, even, v), at_times(t, even, a)
 
 
 def _beginning(t: Array, q: Array, noise: Array) -> tuple[Array, Array]:
@@ -287,12 +273,6 @@ def _in_one_order(recordings: Sequence[Recording]) -> list[int]:
     return sorted(range(len(recordings)), key=content)
 
 
-def as_many(data: Windows, count: int) -> int:
-    """Number of windows of these recordings that last as long as so many whole ones."""
-    seconds = (data.weight > 0.0).any(axis=1).sum() * data.judged_s
-    return max(count, round(count * WINDOW_S * data.count / max(float(seconds), WINDOW_S)))
-
-
 def thin(data: Windows, count: int, moving: bool = False) -> Windows:
     """As much of the windows as `count` whole ones, spread evenly over the recordings; with `moving` the windows of the
     most and fastest motion too, of each joint that moves less in these than elsewhere.
@@ -300,7 +280,8 @@ def thin(data: Windows, count: int, moving: bool = False) -> Windows:
     Of a joint that rests in all windows anything fits: no gain, and any friction. Of one that is slow in all of them
     nothing follows for fast motion.
     """
-    count = as_many(data, count)
+    seconds = (data.weight > 0.0).any(axis=1).sum() * data.judged_s
+    count = max(count, round(count * WINDOW_S * data.count / max(float(seconds), WINDOW_S)))  # some may be shorter
     if data.count <= count:
         return data
     chosen = np.unique(np.linspace(0, data.count - 1, count).round().astype(np.intp))

@@ -7,7 +7,6 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from calib.observer.watch_loop import WatchHistory
 from gcomp.arrays import Array, Mask
 from sim_gap.attribution.causes import remainder
 from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout
@@ -93,7 +92,7 @@ def _bars(names: tuple[str, ...], before: Array, after: Array, label: str) -> An
 def residual_panels(answer: Diagnosis, channel: str) -> Any:
     """One row per joint: residual of `channel` over velocity, position, load and time; None without valid samples."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
-    explained = estimate.predict(data) if estimate is not None else None
+    explained = estimate.predict(data)
     joints = [j for j in range(data.layout.n) if data.valid[channel, j].sum() > 10]
     if not joints:
         return None
@@ -112,7 +111,7 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
         for col, quantity in enumerate(columns, start=1):
             x, place = sides[quantity][chosen, j], {"row": row, "col": col}
             _add_points(figure, x, data.values[channel, j][chosen], GREY, "residual", **place)
-            if explained is not None:
+            if estimate.terms:
                 _add_points(figure, x, explained[channel, j][chosen], ORANGE, "explained", **place)
     for col, quantity in enumerate(columns, start=1):
         figure.update_xaxes(title_text=QUANTITIES[quantity][0], row=len(joints), col=col)
@@ -169,7 +168,7 @@ def law_figure(answer: Diagnosis, law: ResidualLaw) -> Any:
     """Residual that the effects leave of the law's row on held-out data, over its quantity; the law with its band."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     row, joint = (law.channel, law.joint), answer.names[law.joint]
-    left = (data.values if estimate is None else remainder(data, estimate.predict(data)))[row]
+    left = remainder(data, estimate.predict(data))[row]
     if law.directed:
         left = left * np.sign(np.concatenate([s.filtered(s.direction) for s in data.signals])[:, law.joint])
     figure = go.Figure()
@@ -239,7 +238,7 @@ def torque_over_time(answer: Diagnosis, channel: str) -> Any:
     predicted = measured - stacked(data.values)
     lines: list[Line] = [("measured", measured, "black", True), ("nominal", predicted, ORANGE, True)]
     without: dict[str, Array] = {}
-    if estimate is not None:
+    if estimate.terms:
         corrected = predicted + stacked(estimate.predict(data))
         lines.append(("corrected", corrected, BLUE, True))
         for cause in answer.causes[: len(COLOURS)]:
@@ -274,28 +273,3 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
         own = [stage.group for stage in found.stages if stage.group[0].partition("@")[0] == effect]
         without[effect] = moved(without_groups(found.sim, found.search, made, own))[1]
     return _over_time(t, found.sim.arm.names, lines, without, "rad")
-
-
-def watch_figure(
-    history: WatchHistory, joint: int, truth: tuple[Sequence[float], Array], marks: Sequence[tuple[float, str]]
-) -> Any:
-    """The observer's gain and offset of a joint over time with 95 % bands, and what happened when.
-
-    `truth` is times (K,) and true values (2, K).
-    """
-    t, figure = np.array(history.t), make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.08)
-    for row, (name, title) in enumerate((("gain", "gain"), ("offset", "offset [N·m]"))):
-        value, std = (np.array(getattr(history, key))[:, joint] for key in (name, f"{name}_std"))
-        place = {"showlegend": row == 0, "row": row + 1, "col": 1}
-        band = np.concatenate([value + 1.96 * std, (value - 1.96 * std)[::-1]])
-        paint = {"fill": "toself", "fillcolor": "rgba(31,95,168,0.18)", "line": {"width": 0}, "hoverinfo": "skip"}
-        figure.add_scatter(x=np.concatenate([t, t[::-1]]), y=band, name="95 % interval", **paint, **place)
-        figure.add_scatter(x=t, y=value, name="observer", line={"color": BLUE}, **place)
-        figure.add_scatter(x=truth[0], y=truth[1][row], name="truth", line={"color": GREY, "dash": "dot"}, **place)
-        figure.update_yaxes(title_text=title, row=row + 1, col=1)
-    anchor = {"showarrow": False, "xanchor": "left", "yanchor": "bottom", "y": 1.0, "yref": "y domain"}
-    for when, text in marks:
-        figure.add_vline(x=when, line={"color": ORANGE, "width": 1}, row="all", col=1)
-        figure.add_annotation(x=when, text=text, **anchor)
-    figure.update_xaxes(title_text="link time [s]", row=2)
-    return figure.update_layout(height=520, legend={"orientation": "h", "y": 1.1, "x": 0})

@@ -14,10 +14,10 @@ from scipy.signal import find_peaks, peak_widths
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
-from sim_gap.residuals.channel_quality import Disturbance, spectrum
+from sim_gap.residuals.channel_quality import TIMES_USUAL, Disturbance, spectrum
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
-from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, TRIM_S, PreparedSignals
+from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, TRIM_S
 from sim_gap.residuals.residual_set import FEWEST, MOVING_SHARE, ResidualSet, root_mean_square
 
 LOWEST_PEAK_HZ = 1.5 * BAND_HZ
@@ -33,14 +33,11 @@ def regimes_left_out(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
     """Samples at rest and in creep of each motor row that the comparison leaves out, (K,)."""
     share = np.concatenate([s.filtered(s.moving) for s in data.signals])
     out = {}
-    for channel, joint in data.rows:
-        row = (channel, joint)
-        if channel != data.layout.motor:
-            continue
-        known = np.concatenate([_known(data, s, row) for s in data.signals])
-        aside = known & ~data.valid[row] & ~_hit(data)
-        still = share[:, joint] < 1.0 - MOVING_SHARE  # above, and without sliding, it creeps
-        out[row, "rest"], out[row, "creep"] = aside & still, aside & ~still
+    for row in data.rows:
+        if row[0] == data.layout.motor:
+            aside = data.read[row] & ~data.valid[row] & data.calm
+            still = share[:, row[1]] < 1.0 - MOVING_SHARE  # above, and without sliding, it creeps
+            out[row, "rest"], out[row, "creep"] = aside & still, aside & ~still
     return out
 
 
@@ -52,8 +49,6 @@ def share_left_out(data: ResidualSet) -> float:
     return 1.0 - float(np.mean([mask.mean() for mask in judged.values()]))
 
 
-FAR = 8.0
-"""A residual is far off from this many standard deviations of what usually remains (by its median)."""
 JOINTS, SHARE = 3, 0.5
 """Least number of joints that are far off at once, and least share of those that are judged then."""
 AT_ONCE_S = 0.12
@@ -65,11 +60,12 @@ RARE = 0.02
 
 
 def are_far_off(left: Array, valid: Mask, noise: float, margin: float) -> Mask:
-    """Samples of one row at which what remains (K,) is far from usual and more than noise and margin [N·m], (K,)."""
+    """Samples of one row at which what remains (K,) is as far from usual as a spike and more than noise and margin
+    [N·m], (K,)."""
     if not valid.any():
         return np.zeros(len(left), bool)
     usual = max(1.4826 * float(np.median(np.abs(left[valid]))), noise)
-    return np.asarray(valid & (np.abs(left) > max(FAR * usual, margin)))
+    return np.asarray(valid & (np.abs(left) > max(TIMES_USUAL * usual, margin)))
 
 
 def disturbances(time: Array, far: Mask, judged: Mask, left: Array) -> tuple[Disturbance, ...]:
@@ -94,23 +90,15 @@ def disturbances(time: Array, far: Mask, judged: Mask, left: Array) -> tuple[Dis
     return tuple(one for one in out if one.end - one.start <= LONGEST_S)
 
 
-def calm_weight(time: Array, found: tuple[Disturbance, ...]) -> Array:
-    """1 away from disturbances, 0 in them and around, (K,)."""
-    out = np.ones(len(time))
-    for one in found:
-        out[(time >= one.start - TRIM_S) & (time <= one.end + TRIM_S)] = 0.0
-    return out
-
-
 def without_disturbances(data: ResidualSet, explained: Mapping[Row, Array]) -> ResidualSet:
-    """The recordings with the samples of disturbances not `known`; the set itself if there are none.
+    """The recordings with the samples of disturbances and around them not `known`; the set itself if there are none.
 
     `explained` is the prediction of an estimate, (K,) per row.
     """
-    signals, first = [], 0
-    for s, length in zip(data.signals, data.lengths, strict=True):
-        part = slice(first, first + length)
-        far, judged, left = np.zeros((length, s.n), bool), np.zeros((length, s.n), bool), np.zeros((length, s.n))
+    signals = []
+    for s, part in zip(data.signals, data.parts, strict=True):
+        left = np.zeros((part.stop - part.start, s.n))
+        far, judged = np.zeros(left.shape, bool), np.zeros(left.shape, bool)
         for row in data.rows:
             valid, joint = data.valid[row][part], row[1]
             rest = (data.values[row] - explained[row])[part] * valid
@@ -119,11 +107,10 @@ def without_disturbances(data: ResidualSet, explained: Mapping[Row, Array]) -> R
             left[:, joint] = np.maximum(left[:, joint], np.abs(rest))
         found = disturbances(data.time[part], far, judged, left)
         if found:
-            quiet = calm_weight(s.t, found)[:, None]
-            known = {channel: there * quiet for channel, there in s.known.items()}
+            around = [(s.t >= one.start - TRIM_S) & (s.t <= one.end + TRIM_S) for one in found]
+            known = {channel: there * ~np.any(around, axis=0)[:, None] for channel, there in s.known.items()}
             s = replace(s, known=known, disturbances=(*s.disturbances, *found))
         signals.append(s)
-        first += length
     same = all(new is old for new, old in zip(signals, data.signals, strict=True))
     return data if same else ResidualSet(tuple(signals), data.layout)
 
@@ -191,13 +178,3 @@ def _peak(t: Array, values: Array) -> tuple[float, float, float] | None:
         return None
     total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
     return best[0], float(np.sqrt(best[1])), min(best[1] / max(total, 1e-300), 1.0)
-
-
-def _known(data: ResidualSet, s: PreparedSignals, row: Row) -> Mask:
-    there = s.filtered(s.known[row[0]][:, row[1]]) > 0.9
-    reference = data.layout.reference(row)
-    return there & (s.filtered(s.known[reference][:, row[1]]) > 0.9) if reference else there
-
-
-def _hit(data: ResidualSet) -> Mask:
-    return np.asarray(np.any([np.zeros(sum(data.lengths), bool), *data.impacts.values()], axis=0))

@@ -11,12 +11,12 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.signal import butter, sosfiltfilt, sosfreqz
+from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, torque_slopes
+from gcomp.arm.rigid_body import CREEP, LinkMotion, RigidArm, torque_slopes
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_quality import (
     Disturbance,
     Spikes,
@@ -141,8 +141,7 @@ class PreparedSignals:
     @cached_property
     def gravity_columns(self) -> Array:
         """Model torque per unit of gravity along each base axis, (K, n, 3)."""
-        still = np.zeros_like(self.q)
-        return np.stack([self.arm.torque(self.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+        return np.stack([self.arm.gravity_torque(self.q, axis) for axis in np.eye(3)], axis=-1)
 
     def link_regressor(self, link: int) -> Array:
         """Columns of the model torque in a link's inertial parameters, (K, n, 10)."""
@@ -194,12 +193,11 @@ class PreparedSignals:
 
     def filtered(self, x: Array) -> Array:
         """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …)."""
-        pad = min(round(PAD_S * self.rate), len(x) - 1)
-        return np.ascontiguousarray(self.sampled(sosfiltfilt(self._sections, x, axis=0, padlen=pad)))
+        return np.ascontiguousarray(self.sampled(self._low_pass(x)))
 
     @cached_property
-    def _sections(self) -> Array:
-        return np.asarray(butter(4, self.band, fs=self.rate, output="sos"))
+    def _low_pass(self) -> Callable[[Array], Array]:
+        return low_pass(self.band, self.rate, round(PAD_S * self.rate))
 
     def upper_half(self, x: Array) -> Array:
         """RMS within the pass band of white noise with the same RMS in its upper half as `filtered` values x (k, …),
@@ -207,7 +205,8 @@ class PreparedSignals:
         rate = self.rate / self.step
         sections = butter(4, 0.5 * self.band, btype="high", fs=rate, output="sos")
         frequency = np.linspace(0.0, 0.5 * rate, 512)
-        passed = np.abs(sosfreqz(self._sections, frequency, fs=self.rate)[1]) ** 4
+        low = butter(4, self.band, fs=self.rate, output="sos")
+        passed = np.abs(sosfreqz(low, frequency, fs=self.rate)[1]) ** 4
         upper = passed * np.abs(sosfreqz(sections, frequency, fs=rate)[1]) ** 4
         share = upper.sum() / passed.sum()
         return np.asarray(np.sqrt(np.mean(sosfiltfilt(sections, x, axis=0) ** 2, axis=0) / share))
@@ -312,9 +311,7 @@ def _warmth(recording: Recording, times: Array) -> Array | None:
     read = recording.temperature
     if read is None or not np.isfinite(read).any(0).all():
         return None
-    there = [np.isfinite(column) for column in read.T]
-    parts = [np.interp(times, recording.t[ok], column[ok]) for ok, column in zip(there, read.T, strict=True)]
-    return np.stack(parts, axis=1)
+    return at_times(times, recording.t, read)
 
 
 def _without_stuck(s: PreparedSignals, recording: Recording) -> PreparedSignals:
@@ -365,6 +362,14 @@ def interpolate_even(t: Array, values: Array, even: Array, label: str, column: s
     return out
 
 
+def at_times(times: Array, t: Array, values: Array, known: Mask | None = None) -> Array:
+    """Columns (K, n) of values at `t` at other times, along straight lines between those `known` (K, n), by default all
+    that are finite; a column without any is 0."""
+    known = np.isfinite(values) if known is None else known
+    columns = zip(known.T, values.T, strict=True)
+    return np.column_stack([np.interp(times, t[k], x[k]) if k.any() else np.zeros_like(times) for k, x in columns])
+
+
 def coverage(t: Array, values: Array, even: Array) -> Array:
     """1 if a reading is within a few of the channel's own periods, (K, n)."""
     out = np.zeros((len(even), values.shape[1]))
@@ -384,7 +389,22 @@ def decimation(rate: float, stride: int) -> Callable[[Array], Array]:
     return lambda x: low(x)[::stride]
 
 
-def low_pass(cut: float, rate: float) -> Callable[[Array], Array]:
-    """Zero-phase low pass (4th-order Butterworth) at `cut` of signals at `rate` [Hz], along the first axis."""
+def low_pass(cut: float, rate: float, pad: int = 15) -> Callable[[Array], Array]:
+    """Zero-phase low pass (4th-order Butterworth) at `cut` of signals at `rate` [Hz], along the first axis.
+
+    As `scipy.signal.sosfiltfilt`, which finds the filter's state at rest again at each call; `pad` is the length of the
+    reflection at either end, in samples.
+    """
     sections = butter(4, cut, fs=rate, output="sos")
-    return lambda x: np.asarray(sosfiltfilt(sections, x, axis=0))
+    at_rest = sosfilt_zi(sections)[:, None]
+
+    def both_ways(x: Array) -> Array:
+        edge, columns = min(pad, len(x) - 1), x.reshape(len(x), -1).T
+        before = 2.0 * columns[:, :1] - columns[:, edge:0:-1]
+        after = 2.0 * columns[:, -1:] - columns[:, -2 : -edge - 2 : -1]
+        longer = np.hstack([before, columns, after])
+        for _ in range(2):
+            longer = sosfilt(sections, longer, zi=at_rest * longer[:, :1])[0][:, ::-1]
+        return np.asarray(longer[:, edge : edge + len(x)].T.reshape(x.shape))
+
+    return both_ways

@@ -86,6 +86,13 @@ class ResidualSet:
         """Number of samples of each recording."""
         return tuple(len(s.filtered(s.t)) for s in self.signals)
 
+    @property
+    def parts(self) -> list[slice]:
+        """Samples of each recording."""
+        return [
+            slice(end - length, end) for end, length in zip(np.cumsum(self.lengths).tolist(), self.lengths, strict=True)
+        ]
+
     @cached_property
     def time(self) -> Array:
         """Time since the start of each recording [s], (K,)."""
@@ -120,34 +127,40 @@ class ResidualSet:
     def impacts(self) -> dict[int, Mask]:
         """Joints whose gear hits at torque reversals, and the samples near those, (K,) each."""
         sensor, out = self.layout.sensor, dict[int, Mask]()
-        first = 0
-        for s, length in zip(self.signals if sensor else (), self.lengths, strict=False):
-            part = slice(first, first + length)
+        for s, part in zip(self.signals, self.parts, strict=True) if sensor else ():
             rest = np.stack([self.values[str(sensor), j][part] for j in range(self.layout.n)], axis=1)
             for joint, near in near_impacts(s, str(sensor), rest).items():
                 row = (str(sensor), joint)
                 if root_mean_square(rest[near, joint]) < self.margin[row] - 2.0 * self.floor[row]:
                     continue
                 out.setdefault(joint, np.zeros(sum(self.lengths), bool))[part] = near
-            first += length
         return out
 
     @cached_property
     def valid(self) -> dict[Row, Mask]:
-        """Samples that count: read and not interpolated, away from gear impacts, and in motion for the motor row."""
-        out: dict[Row, list[Mask]] = {row: [] for row in self.rows}
-        for s in self.signals:
-            moving = sliding(s)
-            for channel, joint in self.rows:
-                there = s.filtered(s.known[channel][:, joint]) > 0.9
-                reference = self.layout.reference((channel, joint))
-                if reference:
-                    there &= s.filtered(s.known[reference][:, joint]) > 0.9
-                if channel == self.layout.motor or (channel == self.layout.command and self.layout.beyond(joint)):
-                    there &= moving[:, joint]
-                out[channel, joint].append(there)
-        calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.impacts.values()], axis=0)
-        return {row: np.concatenate(parts) & calm for row, parts in out.items()}
+        """Samples that count: read, away from gear impacts, and in motion for the motor row, (K,) per row."""
+        sliding = np.concatenate([slides_steadily(s) for s in self.signals])
+        out = {}
+        for (channel, joint), there in self.read.items():
+            rubs = channel == self.layout.motor or (channel == self.layout.command and self.layout.beyond(joint) > 0)
+            out[channel, joint] = there & self.calm & (sliding[:, joint] | (not rubs))
+        return out
+
+    @cached_property
+    def read(self) -> dict[Row, Mask]:
+        """Samples at which a row's channel and its reference were read and not interpolated, (K,) per row."""
+        known = {
+            channel: np.concatenate([s.filtered(s.known[channel]) for s in self.signals]) > 0.9
+            for channel in (self.layout.sensor, self.layout.motor, self.layout.command)
+            if channel
+        }
+        channels = {row: filter(None, (row[0], self.layout.reference(row))) for row in self.rows}
+        return {row: np.all([known[name][:, row[1]] for name in names], axis=0) for row, names in channels.items()}
+
+    @cached_property
+    def calm(self) -> Mask:
+        """Samples away from impacts of gears, (K,)."""
+        return np.asarray(~np.any([np.zeros(sum(self.lengths), bool), *self.impacts.values()], axis=0))
 
     @cached_property
     def floor(self) -> dict[Row, float]:
@@ -243,7 +256,7 @@ def residual_sets(
     return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
-def sliding(s: PreparedSignals) -> Mask:
+def slides_steadily(s: PreparedSignals) -> Mask:
     """Samples at which each joint slides before and after, so that its friction is fully developed, (k, n).
 
     Around rest and reversals friction builds up over some distance. If a joint hardly does anything else, these samples

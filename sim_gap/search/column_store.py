@@ -5,16 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array
 from sim_gap.residuals.layout import Columns, Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate_signals import EstimateSignals, Values, signals_about
 from sim_gap.search.term import Term
-
-UNCHANGED, LINEAR = 1e-12, 1e-9
-CLOSE = 0.1
-"""Change of a joint's torque between nominal model and estimate, as a share of it, up to which levels found from the
-nominal torque serve for both."""
 
 
 class ColumnStore:
@@ -26,25 +21,14 @@ class ColumnStore:
         values: Values | None = None,
         nominal: "ColumnStore | None" = None,
         pins: Values | None = None,
-        slopes: "ColumnStore | None" = None,
     ) -> None:
-        """`nominal` is the store about the nominal model; `pins` are coefficients that every fit on it keeps.
-        `slopes` is a store about another estimate whose derivatives stand in for this one's."""
+        """`nominal` is the store about the nominal model; `pins` are coefficients that every fit on it keeps."""
         self.data, self.values, self.nominal, self.pins = data, dict(values or {}), nominal, dict(pins or {})
-        self.slopes = slopes
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(self, values: Values, pins: Values | None = None, slopes: "ColumnStore | None" = None) -> "ColumnStore":
-        return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
-
-    @cached_property
-    def other_torques(self) -> Mask:
-        """Joints whose torque about the estimate is not close to the nominal model's, (n,)."""
-        pairs = [(one.signals.model, one.signals.read.model) for one in self.about]
-        moved = [np.sqrt(np.mean((now - nominal) ** 2, axis=0)) for now, nominal in pairs]
-        size = [np.sqrt(np.mean(nominal**2, axis=0)) for _, nominal in pairs]
-        return np.asarray(np.max(moved, axis=0) > CLOSE * np.max(size, axis=0))
+    def at(self, values: Values, pins: Values | None = None) -> "ColumnStore":
+        return ColumnStore(self.data, values, self.nominal or self, pins)
 
     @cached_property
     def about(self) -> list[EstimateSignals]:
@@ -84,10 +68,9 @@ class ColumnStore:
         return np.hstack([*own, *beside, np.zeros((total, 0))])
 
     def _compute(self, term: Term) -> None:
-        known = self._in_slopes(term)
-        if known is not None:
-            self._columns[term] = known
-            self._offsets[term] = self._beside(term)
+        unchanged = self._of_motion(term)
+        if unchanged is not None:
+            self._columns[term], self._offsets[term] = unchanged, {}
             return
         found = [self._of(one, term) for one in self.about]
         rows = list(dict.fromkeys(row for own, _ in found for row in own))
@@ -106,25 +89,16 @@ class ColumnStore:
         self._columns[term] = {row: x[:, :width] for row, x in whole.items()}
         self._offsets[term] = {row: x[:, width:] for row, x in whole.items()} if nonlinear else {}
 
-    def _in_slopes(self, term: Term) -> Columns | None:
-        """The columns of a term of the estimate in the store whose derivatives stand in; None if it has none."""
-        if self.slopes is None or term not in self.values:
+    def _of_motion(self, term: Term) -> Columns | None:
+        """The nominal model's columns of a term that no estimate changes but by the gain of its motor; None if this one
+        has the term, or moves positions."""
+        signature = term.form.signature
+        moved = any(one.signals.q is not one.signals.read.q for one in self.about)
+        if self.nominal is None or not signature.of_motion or term in self.values or moved:
             return None
-        if term.form.signature.offset is not None:  # its coefficients mean the same at every shape
-            term = next((other for other in self.slopes.values if other.key == term.key), term)
-        return self.slopes._columns.get(term)
-
-    def _beside(self, term: Term) -> Columns:
-        """Part of a term beside derivatives that are not about its estimate, (K, 1) per row."""
-        own, layout = self._columns[term], self.data.layout
-        parts = []
-        for one in self.about:
-            share, none = layout.compared(one.shares[term]), np.zeros(len(one.signals.t))
-            parts.append(one.signals.filtered(np.stack([share.get(row, none) for row in own], axis=1)))
-        whole = np.concatenate(parts)
-        beside = {row: whole[:, k, None] - own[row] @ self.values[term][:, None] for k, row in enumerate(own)}
-        linear = np.abs(whole).max(initial=0.0) * LINEAR
-        return beside if any(np.abs(x).max(initial=0.0) > linear for x in beside.values()) else {}
+        own = self.nominal.columns(term)
+        gain = self.about[0].motor_gain if signature.side == "motor" else np.ones(self.data.layout.n)
+        return {row: x if gain[row[1]] == 1.0 else x * gain[row[1]] for row, x in own.items()}
 
     def _of(self, one: EstimateSignals, term: Term) -> tuple[Columns, Columns]:
         """Columns of a term in one recording and what it is beside them, at the work rate."""
@@ -138,8 +112,8 @@ class ColumnStore:
         if values is not None:
             share = one.shares[term]
             beside = {row: share.get(row, 0.0) - own[row] @ values for row in own}
-            small = all(np.abs(x).max(initial=0.0) < UNCHANGED for x in beside.values())
-            beside = {} if small else beside
+            linear = all(np.allclose(x, 0.0) for x in beside.values())
+            beside = {} if linear else beside
         else:
             beside = signature.offset(one.signals, layout, term.shape) if signature.offset else {}
             if not any(np.any(x) for x in beside.values()):
@@ -152,7 +126,7 @@ class ColumnStore:
         if side == "motor":
             return {row: x * one.motor_gain[row[1]] for row, x in plain.items()}
         if side == "distortion":
-            return {row: x * _own_gain(one, row[1]) for row, x in plain.items()}
+            return {row: x * one.sensor_gain[row[1], row[1]] for row, x in plain.items()}
         if side != "link":
             return plain
         out: Columns = {}
@@ -167,13 +141,9 @@ class ColumnStore:
             out[layout.sensor, i] = read
             if layout.motor:
                 made = torque[i] * one.motor_slope[:, i, None] if i in torque else np.zeros_like(read)
-                if np.abs(made - read).max(initial=0.0) > UNCHANGED:
+                if not np.allclose(made, read):
                     out[layout.motor, i] = made - read
         return out
-
-
-def _own_gain(one: EstimateSignals, joint: int) -> float:
-    return float(one.sensor_gain[joint, joint])
 
 
 def _width(columns: Columns) -> int:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gcomp.arm.inertials import move_mass, point_mass
 from gcomp.arrays import Array
-from sim_gap.effects.base import tilt_gravity
-from sim_gap.effects.link import mount_matrix, move_mass, point_mass
+from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import Found, PreparedSignals
 from sim_gap.search.term import Term
@@ -108,11 +108,11 @@ def _bodies(
             share = read.link_regressor(link) @ change
             torque = torque + share
             shares[term] = {(channel, int(j)): share[:, j] for j in np.flatnonzero(arm.carries[:, link])}
-    arm = arm.with_inertial(inertial)
+    arm = replace(arm, inertial=inertial)
     for term, c in ours.items():
         if term.effect == "base.tilt":
-            turned, still = tilt_gravity(arm.gravity, c), np.zeros_like(read.q)
-            share = arm.torque(read.q, still, still, turned - arm.gravity)
+            turned = tilt_gravity(arm.gravity, c)
+            share = arm.gravity_torque(read.q, turned - arm.gravity)
             arm, torque = replace(arm, gravity=turned), torque + share
             shares[term] = {(channel, j): share[:, j] for j in range(arm.n)}
     s = replace(read, arm=arm, found=Found(read, torque, np.zeros_like(read.q), np.zeros_like(read.q)))

@@ -1,7 +1,5 @@
 """Gauss-Newton steps: fit the terms, evaluate their columns about the fit, fit again until both agree.
 
-Derivatives are kept from one step to the next while the steps shrink; the prediction itself is always exact.
-
 A fit of a link's inertia may want a body that no distribution of mass has. Then the coefficients are those of the least
 increase of the weighted squares for which one has: the link's pseudo-inertia matrix stays positive definite. All other
 coefficients are fitted to that.
@@ -13,9 +11,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from gcomp.arm.inertials import pseudo_inertia
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.exchange import AS_GOOD
-from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
@@ -112,8 +110,6 @@ def _farthest(inside: Array, end: Array, matrix: Matrix) -> Array:
 
 AGREED = 5e-3
 """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
-SLOW = 0.5
-"""Change of a step, as a share of the last one's, from which derivatives are evaluated again."""
 STEPS, HALVINGS = 10, 3
 """Most steps, and most halvings of one."""
 
@@ -130,38 +126,26 @@ def converge(
     """
     terms = [term.start for term in terms]
     values = {term: c for term, c in (start or {}).items() if term in terms}
-    best, kept, held, last = np.inf, values, Values(), np.inf
+    best, kept, held = np.inf, values, Values()
     arm = nominal.data.signals[0].arm
-    slopes: ColumnStore | None = None
     for _ in range(STEPS):
-        equations = TermEquations(nominal.at(values, slopes=slopes), terms)
+        equations = TermEquations(nominal.at(values), terms)
         now = score(equations, values)
         halved = 0
         while values and now > best + AS_GOOD and halved < HALVINGS:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
-            equations = TermEquations(nominal.at(values, slopes=slopes), terms)
+            equations = TermEquations(nominal.at(values), terms)
             now, halved = score(equations, values), halved + 1
         if values:
-            best, kept, slopes = now, values, slopes or equations.store
+            best, kept = now, values
         held = pins(equations, arm)
         if held:
-            equations = TermEquations(nominal.at(values, held, slopes=slopes), terms)
-        found = fitted(equations)
+            equations = TermEquations(nominal.at(values, held), terms)
+        found = equations.fitted()
         terms, values = relinearised_at(found)
-        if kept and set(terms) == set(kept):
-            change = _change(equations, kept, found)
-            if change <= AGREED:
-                break
-            slopes = None if change > SLOW * last or halved else slopes
-            last = change
+        if kept and set(terms) == set(kept) and _change(equations, kept, found) <= AGREED:
+            break
     return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
-
-
-def fitted(equations: TermEquations) -> Values:
-    """Coefficients of a fit of all terms, the rows weighed by what it leaves."""
-    every = equations.index(equations.terms).tolist()
-    change = equations.linear.reweighed(every).fit(every)
-    return {term: change[at] for term, at in equations.at.items()}
 
 
 def relinearised_at(found: Values) -> tuple[list[Term], Values]:
@@ -184,8 +168,7 @@ def score(equations: TermEquations, values: Values) -> float:
         if term in equations.at:
             change[equations.at[term]] = c
     change[list(equations.fixed.values())] = 1.0
-    squares = equations.mean_square(change)
-    return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
+    return equations.log_squares(change)
 
 
 def _change(equations: TermEquations, old: Values, new: Values) -> float:
@@ -198,5 +181,5 @@ def _change(equations: TermEquations, old: Values, new: Values) -> float:
     after[list(equations.fixed.values())] = 1.0
     power = [moved[i] @ s.sum(0) @ moved[i] for i, s in zip(linear.acting, linear.squares, strict=True)]
     power = np.array(power) / np.maximum(linear.counts.sum(1), 1e-300)
-    left = equations.mean_square(after) + linear.floor**2
+    left = linear.mean_squares(after) + linear.floor**2
     return float(np.sqrt(np.max((power / left)[equations.seen], initial=0.0)))

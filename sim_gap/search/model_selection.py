@@ -12,7 +12,7 @@ from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
-from sim_gap.search.gauss_newton import Values, converge, fitted
+from sim_gap.search.gauss_newton import Values, converge
 from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
@@ -64,17 +64,23 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
 def search_again(
     store: ColumnStore, chosen: Sequence[Term], offered: Sequence[Term], usual: frozenset[str] = frozenset()
 ) -> TermChoice:
-    """The terms offered, searched about the fit of those that are chosen, until both agree."""
-    terms = refine(store, first_of_each([canonical_term(term) for term in chosen]))
+    """The terms offered, searched with columns about the fit of those that are chosen, until both agree."""
+    terms = refine(store, first_of_each(chosen))
     values: Values = {}
     for _ in range(ROUNDS):
-        choice = refit_about_itself(store, terms, offered, values, usual)
+        about, terms = converge(store, terms, values)
+        refined = refine(about, terms)
+        if refined != terms:
+            about, terms = converge(store, refined, about.values)
+        keys = {term.key for term in terms}
+        others = [term for term in offered if term.key not in keys]
+        equations = TermEquations(about, [*terms, *relinearised_in_place(about, terms, others)])
+        choice = TermChoice(equations, terms, usual, AGAIN * equations.measurements)
         keys = {term.key for term in choice.current}
         choice.run()
         if {term.key for term in choice.current} == keys:
             break
-        values = choice.equations.store.values
-        terms = first_of_each([canonical_term(term) for term in choice.current])
+        terms, values = first_of_each(choice.current), about.values
     return choice
 
 
@@ -84,38 +90,6 @@ def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term]
     choice = TermChoice(TermEquations(store, candidates(store.data, library)))
     choice.run()
     return likely_shapes(choice), choice.current
-
-
-def refit_about_itself(
-    nominal: ColumnStore,
-    chosen: list[Term],
-    offered: Sequence[Term],
-    start: Values,
-    usual: frozenset[str] = frozenset(),
-) -> TermChoice:
-    """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
-    `start` on."""
-    store, chosen = converge(nominal, chosen, start)
-    refined = refine(store, chosen)
-    if refined != chosen:
-        store, chosen = converge(nominal, refined, store.values)
-    keys = {term.key for term in chosen}
-    others = [term for term in set_levels(store, offered) if term.key not in keys]
-    rivals = relinearised_in_place(store, chosen, others)
-    equations = TermEquations(store, [*chosen, *rivals])
-    return TermChoice(equations, chosen, usual, AGAIN * equations.measurements)
-
-
-def set_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
-    """The terms offered, with levels of limits, plays and dead bands from the torques about an estimate."""
-    other, signals = store.other_torques, [one.signals for one in store.about]
-
-    def follows(term: Term) -> bool:
-        return term.form.signature.side == "distortion" and term.free is not None and bool(other[term.place])
-
-    keys = dict.fromkeys(term.key for term in offered if follows(term))
-    levels = [Term(name, j, shape) for name, j in keys for shape in effects()[name].hints.grid(signals, j)]
-    return [*(term for term in offered if not follows(term)), *levels]
 
 
 AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
@@ -151,13 +125,10 @@ def likely_shapes(choice: TermChoice) -> list[Term]:
     return [term for term in choice.equations.terms if term in kept]
 
 
-def canonical_term(term: Term) -> Term:
-    """The term under which one is reported, of those that show exactly alike."""
-    return Term(term.effect, *term.form.hints.canonical(term.place, term.shape))
-
-
 def first_of_each(terms: Sequence[Term]) -> list[Term]:
-    """The terms, only the first of each effect and place: two shapes approximate one between them."""
+    """The terms as they are reported where several show alike, only the first of each effect and place: two shapes
+    approximate one between them."""
+    terms = [Term(term.effect, *term.form.hints.canonical(term.place, term.shape)) for term in terms]
     return list({term.key: term for term in reversed(terms)}.values())[::-1]
 
 
@@ -178,8 +149,7 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
 
         def fit(other: Term, term: Term = term) -> float:
             equations = TermEquations(store, [other if each == term else each for each in out])
-            squares = equations.mean_square(equations.linear.fit(equations.index(equations.terms).tolist()))
-            return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
+            return equations.log_squares(equations.linear.fit(equations.index(equations.terms).tolist()))
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
             options = {"xatol": SHAPE_STEP * (high - low)}
@@ -213,7 +183,7 @@ def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:
     """The terms, nonlinear effects linearised at their fitted size."""
     if all(term.form.hints.linearised_at is None for term in active):
         return active
-    return [term.relinearised(c) for term, c in fitted(TermEquations(store, active)).items()]
+    return [term.relinearised(c) for term, c in TermEquations(store, active).fitted().items()]
 
 
 def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[Term]) -> list[Term]:

@@ -102,9 +102,16 @@ class TermEquations:
         shape = len(term.shape) * (form.hints.linearised_at is None)
         return PRICE * (self.linear.freedom(self.at[term].tolist()) + shape + form.plausibility.prior_penalty)
 
-    def mean_square(self, change: Array) -> Array:
-        """Mean square of the residual per row after subtracting the terms with these coefficients (P,), (R,)."""
-        return self.linear.mean_squares(change)
+    def log_squares(self, change: Array) -> float:
+        """Σ ½ log(R² + floor²) over the rows, R² the mean square that terms with these coefficients (P,) leave."""
+        squares = self.linear.mean_squares(change) + self.linear.floor**2
+        return float(0.5 * np.log(squares)[self.seen].sum())
+
+    def fitted(self) -> dict[Term, Array]:
+        """Coefficients of a fit of all terms, the rows weighed by what it leaves."""
+        every = self.index(self.terms).tolist()
+        change = self.linear.reweighed(every).fit(every)
+        return {term: change[at] for term, at in self.at.items()}
 
     @property
     def measurements(self) -> float:

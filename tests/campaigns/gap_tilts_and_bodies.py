@@ -21,7 +21,7 @@ from wrong_arms import THREE, Wrong, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.effects.base import tilt_gravity
+from sim_gap.effects.link import tilt_gravity
 
 ANGLE_DEG, OTHERS, MASS = 0.5, 0.5, 0.05
 SECONDS, RATE = 30.0, 50.0

@@ -13,11 +13,11 @@ import numpy as np
 from armlink.recording.recording import Recording
 from calib.arm.urdf import xml_comment
 from gcomp.arrays import Array, Mask
-from sim_gap.better_model.corrected_model import spec_of, write_changes
+from sim_gap.better_model.corrected_model import write_changes
 from sim_gap.better_model.export import CorrectedText
-from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
-from sim_gap.model.load import SimModel
+from sim_gap.better_model.forward_effects import STEP_S, JointEffect
+from sim_gap.better_model.native_drives import put_delay
+from sim_gap.model.load import SimModel, named_spec
 from sim_gap.position_gap.choice import id_of, present, without_group
 from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch
 from sim_gap.position_gap.parameters import EFFECTS
@@ -116,7 +116,7 @@ def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
     which no body's `gravcomp` holds."""
     arm, share = search.arm, fit.point["feed"]
     q = search.data.first.T
-    feels = np.abs(arm.torque(q, 0.0 * q, 0.0 * q)).max(0) > FELT_NM
+    feels = np.abs(arm.gravity_torque(q)).max(0) > FELT_NM
     if not feels.any() or np.ptp(share[feels]) > ALIKE:
         return None
     return np.full(search.data.joints, float(share[feels].mean()))
@@ -135,7 +135,7 @@ def export_fit(
     sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit, held: Collection[str] = NATIVE
 ) -> Exported:
     """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
-    spec, left, plant = spec_of(sim), effects_left_out(search, fit, held), MovedModel(sim)
+    spec, left, plant = named_spec(sim), effects_left_out(search, fit, held), MovedModel(sim)
     point = {name: value.copy() for name, value in native.point.items()}
     for name in ("kp", "back_emf"):
         point[name][~plant.driven] = 0.0  # of an actuator that the file gets
@@ -148,7 +148,7 @@ def export_fit(
     for j in range(sim.n):
         _set_actuator(spec, plant, model, native, j)
     if any(actuator.delay > 0.0 for actuator in spec.actuators):
-        spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
+        spec.option.timestep = min(float(spec.option.timestep), STEP_S)
     spec.compile()
     head = "These effects are left out, since MJCF has no field for them (the other effects were fitted without them):"
     comment = xml_comment([head, *left]) if left else ""

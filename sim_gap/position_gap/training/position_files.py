@@ -12,13 +12,12 @@ from sim_gap.better_model.export import module_path, module_text, write_files
 from sim_gap.better_model.training_files import Row, steps_of, write_entries, write_rows
 from sim_gap.position_gap.choice import present
 from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.bands import SHARE
 from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, effects_left_out, export_fit, native_fit
 from sim_gap.position_gap.training.spread import draw
 
 DELAY_DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
-DELAY_QUANTILES = 0.05, 0.95
-"""Quantiles of these draws that are the ends of the range."""
 
 
 def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
@@ -100,8 +99,12 @@ def _entry(found: Identified, j: int, step: float, drawn: Sequence[Mapping[str, 
 
 
 def _delays(found: Identified, j: int, rows: Sequence[Mapping[str, float]]) -> Array:
-    """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
+    """Ends of the range of a joint's delay [s], (2,): that of the SHARE of its draws, about the exported model's."""
     name = f"{found.sim.arm.names[j]}.delay"
     drawn = [row[name] for row in rows if name in row]
-    about = np.quantile(drawn, DELAY_QUANTILES) - found.fit.point["delay"][j] if drawn else np.zeros(2)
+    about = (
+        np.quantile(drawn, (0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE)) - found.fit.point["delay"][j]
+        if drawn
+        else np.zeros(2)
+    )
     return np.asarray(found.native.point["delay"][j] + about)

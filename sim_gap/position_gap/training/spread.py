@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.stats import norm, t
 
+from gcomp.arm.inertials import LIGHT_KG
 from gcomp.arrays import Array
 from gcomp.estimate.solve import LONGEST_STEP, precision
+from sim_gap.position_gap.choice import LOOSE
 from sim_gap.position_gap.fit import Layout, LoopFit, LoopSearch, Place, acting, jacobian, rms_on
-from sim_gap.position_gap.judge import LOOSE
 from sim_gap.position_gap.parameters import LOGARITHMIC, PARAMETERS, UNIT, WITH_TORQUE
-from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
-from sim_gap.position_gap.training.unreached_limits import Unreached, draw_limits
+from sim_gap.position_gap.sound_arm import errors_of, omitted_of
+from sim_gap.position_gap.training.unreached_limits import Unreached
 from sim_gap.position_gap.windows import Windows
 
 INSIDE = 0.95
@@ -47,8 +48,6 @@ WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
 LEAST_MOMENT = 1e-8
 """Standard deviation of a mass moment of a link without mass [kg·m]."""
-LIGHTEST = 1e-3
-"""Mass of a payload [kg] that its moment is divided by at least."""
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
 
@@ -244,8 +243,7 @@ def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
 
 def _besides(search: LoopSearch, names: Sequence[Place]) -> Array:
     """Variances by what sound arms have besides of friction and of lateness, (K,)."""
-    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
-    sizes = {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
+    sizes = omitted_of(search)
     return np.square([sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names])
 
 
@@ -280,7 +278,7 @@ def interval(
 def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> tuple[float, float, float, str]:
     """A coordinate of a payload's centre of mass, from its mass moment: value, ends of its 95 % interval, unit."""
     mass, moment = (float(fit.point[name][0]) for name in ("payload.mass", column))
-    divisor = float(np.copysign(max(abs(mass), LIGHTEST), mass))
+    divisor = float(np.copysign(max(abs(mass), LIGHT_KG), mass))
     centre, change = moment / divisor, np.zeros(len(spread.names))
     change[spread.names.index((-1, column))] = 1.0 / divisor
     change[spread.names.index((-1, "payload.mass"))] = -centre / divisor
@@ -307,8 +305,8 @@ def draw(
     problem, about = layout.problem(), layout.theta(layout.point)
     points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
-    for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
-        for row, value in zip(rows, drawn, strict=True):
+    for each in spread.limits:
+        for row, value in zip(rows, each.draws(count, random), strict=True):
             row[_label(search, each.joint, each.name)] = float(value)
     return rows
 

@@ -38,6 +38,10 @@ class Unreached:
     def most(self) -> float:
         return HEADROOM * self.least
 
+    def draws(self, count: int, random: np.random.Generator) -> Array:
+        """(count,)."""
+        return np.asarray(self.least * HEADROOM ** random.uniform(size=count))
+
 
 def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
     """The limits that neither the model states nor the fit has. Nothing of joints that rest."""
@@ -93,11 +97,6 @@ def _highest(search: LoopSearch, values: Array) -> Array:
     return np.array(
         [float(values[:, j][counted[:, j]].max()) if counted[:, j].any() else 0.0 for j in range(search.data.joints)]
     )
-
-
-def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:
-    """Draws of each limit, (count,)."""
-    return [np.asarray(each.least * HEADROOM ** random.uniform(size=count)) for each in limits]
 
 
 def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:

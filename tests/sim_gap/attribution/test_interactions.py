@@ -10,10 +10,9 @@ from wrong_arms import THREE, Wrong, model, record
 
 from armlink.model_file import compile_model
 from armlink.recording.recording import Recording
-from gcomp.arm.inertials import pseudo_inertia
+from gcomp.arm.inertials import move_mass, point_mass, point_slopes, pseudo_inertia
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.effects.base import angles_of, tilt_gravity
-from sim_gap.effects.link import move_mass, point_mass, point_slopes
+from sim_gap.effects.link import angles_of, tilt_gravity
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

@@ -96,7 +96,7 @@ def test_two_motors_may_turn_with_the_same_pair_of_joints():
 
 def test_an_arm_files_model_can_be_written_too(tmp_path):
     nominal = load_model("sarcos")
-    write_model(nominal, None, tmp_path / "sarcos.xml")
+    write_model(nominal, SimpleNamespace(terms=()), tmp_path / "sarcos.xml")
     same = load_model(tmp_path / "sarcos.xml")
     q, v, a = np.random.default_rng(0).uniform(-1, 1, (3, 4, nominal.n))
     assert same.arm.torque(q, v, a) == pytest.approx(

@@ -13,7 +13,7 @@ from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import RATE
 from sim_gap.blind.recipe import OTHER_PAIR, CaseRecipe
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.tables import _percent
+from sim_gap.commands.gap_bench import _percent
 
 K = 400
 STEP_S = 0.05

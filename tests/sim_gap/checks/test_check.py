@@ -253,7 +253,7 @@ def test_a_tool_that_outweighs_the_last_link_is_no_zero_of_its_joint():
     body = np.array([0.6, 0.05, 0.0, 0.05]) * [1.0, 0.6, 0.6, 0.6]
     loaded = arm.inertial.copy()
     loaded[-1, :4] += body
-    reading = arm.with_inertial(loaded).torque(q, v, a) + 0.2 * np.tanh(v / 0.01)
+    reading = replace(arm, inertial=loaded).torque(q, v, a) + 0.2 * np.tanh(v / 0.01)
     assert wrong_columns(arm, q, v, a, reading) is None
 
 

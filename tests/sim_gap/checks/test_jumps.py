@@ -8,7 +8,7 @@ from wrong_arms import Wrong, model, record
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
+from sim_gap.checks.positions import find_jumps, find_seam, unwrap
 
 
 def of_position(position: np.ndarray, rate: float) -> Recording:
@@ -25,15 +25,15 @@ def at_rest_between(moves: int, rate: float = 10.0) -> Recording:
 
 @pytest.mark.parametrize("moves", [1, 3, 10])
 def test_an_arm_that_rests_and_moves_now_and_then_does_not_jump(moves):
-    assert find_jumps(at_rest_between(moves), AS_IT_IS) == []
+    assert find_jumps(at_rest_between(moves), AS_IT_IS) is None
 
 
 def test_poses_put_together_jump():
     """At rest in either: nothing but the jump is a motion."""
-    (finding,) = find_jumps(of_position(np.repeat([0.0, 0.3], 500), 100.0), AS_IT_IS)
+    finding = find_jumps(of_position(np.repeat([0.0, 0.3], 500), 100.0), AS_IT_IS)
     assert finding.finding == "dropped"
     assert "jumps by 0.30 rad" in finding.evidence
-    assert find_jumps(of_position(np.repeat([0.0, 0.3], 500), 100.0), parse_corrections(clock=["t=0"])) == []
+    assert find_jumps(of_position(np.repeat([0.0, 0.3], 500), 100.0), parse_corrections(clock=["t=0"])) is None
 
 
 @pytest.mark.parametrize("turn", [2.0 * np.pi, 360.0])
@@ -43,7 +43,7 @@ def test_positions_wrap_in_radians_and_in_degrees(turn):
     corrected, (finding,) = unwrap(recording)
     assert (finding.finding, finding.corrected) == ("zero", True)
     np.testing.assert_allclose(np.diff(corrected.position[:, 0]), np.diff(far), atol=1e-9 * turn)
-    assert find_jumps(corrected, AS_IT_IS) == []
+    assert find_jumps(corrected, AS_IT_IS) is None
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +68,13 @@ def without(recording: Recording, first: int, last: int) -> Recording:
 
 def test_pieces_whose_ends_are_near_meet_at_a_seam(slow):
     """The piece that is lost is short, and no joint goes far in it."""
-    assert find_seam(slow, AS_IT_IS) == []
+    assert find_seam(slow, AS_IT_IS) is None
     pieces = without(slow, 600, 609)
-    assert find_jumps(pieces, AS_IT_IS) == []
-    (finding,) = find_seam(pieces, AS_IT_IS)
+    assert find_jumps(pieces, AS_IT_IS) is None
+    finding = find_seam(pieces, AS_IT_IS)
     assert finding.finding == "dropped"
     assert "t = 20.0" in finding.evidence
-    assert find_seam(pieces, parse_corrections(clock=["t=0"])) == []
+    assert find_seam(pieces, parse_corrections(clock=["t=0"])) is None
 
 
 def test_a_stop_from_one_row_to_the_next_is_no_seam(slow):
@@ -84,12 +84,12 @@ def test_a_stop_from_one_row_to_the_next_is_no_seam(slow):
         values = getattr(stops, channel).copy()
         values[601:] = value
         stops = replace(stops, **{channel: values})
-    assert find_seam(stops, AS_IT_IS) == []
+    assert find_seam(stops, AS_IT_IS) is None
 
 
 def test_a_single_row_that_is_missing_is_no_seam(slow):
-    assert find_seam(without(slow, 600, 601), AS_IT_IS) == []
+    assert find_seam(without(slow, 600, 601), AS_IT_IS) is None
 
 
 def test_without_velocities_no_seam_is_looked_for(slow):
-    assert find_seam(replace(without(slow, 600, 609), velocity=None), AS_IT_IS) == []
+    assert find_seam(replace(without(slow, 600, 609), velocity=None), AS_IT_IS) is None

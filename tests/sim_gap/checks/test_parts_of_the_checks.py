@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armlink.recording.corrections import Corrections
-from sim_gap.checks.joint_range import _degrees
+from sim_gap.checks.positions import _degrees
 from sim_gap.checks.sampling import _sample_times
 
 NOTHING_STATED = Corrections()

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcomp.arm.inertials import pseudo_inertia
+from gcomp.arm.inertials import point_mass, pseudo_inertia
 from sim_gap.effects.drive import _lag
 from sim_gap.effects.effect import Ratings
-from sim_gap.effects.link import point_mass
 from sim_gap.effects.registry import effects
 
 

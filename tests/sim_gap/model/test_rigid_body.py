@@ -6,9 +6,9 @@ import pytest
 from wrong_arms import THREE
 
 from armlink.errors import BadInput
-from sim_gap.effects.link import moment_to_inertia
+from gcomp.arm.inertials import moment_to_inertia
+from gcomp.arm.rigid_body import RigidArm, torque_slopes
 from sim_gap.model.load import load_model, rigid_arm
-from sim_gap.model.rigid_body import RigidArm, torque_slopes
 
 
 def random_arm(n: int, seed: int) -> str:

@@ -1,13 +1,13 @@
 """Columns and signals about an estimate, and single steps of search and fit, each against its own definition."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.link import point_mass
+from gcomp.arm.inertials import point_mass
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
@@ -36,7 +36,7 @@ def test_an_estimate_with_a_payload_has_the_torque_of_the_arm_with_that_mass(dat
     c = np.array([0.4, 0.01, 0.02, 0.08])
     inertial = read.arm.inertial.copy()
     inertial[-1] += point_mass(0.4, c[1:])
-    expected = read.arm.with_inertial(inertial).torque(read.q, read.v, read.a)
+    expected = replace(read.arm, inertial=inertial).torque(read.q, read.v, read.a)
     np.testing.assert_allclose(signals_about(read, data.layout, {PAYLOAD: c}).signals.model, expected, atol=1e-9)
 
 

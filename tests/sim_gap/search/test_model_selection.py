@@ -10,7 +10,6 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.gauss_newton import fitted
 from sim_gap.search.model_selection import candidates, refine, select_model
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
@@ -93,7 +92,7 @@ def test_no_breakaway_is_negative_though_friction_rises_with_speed():
     signals = prepare(recording, load_model(model()).arm, "a recording")
     store = ColumnStore(ResidualSet((signals,), layout_of([signals])))
     terms = [Term("friction.coulomb", 1), Term("friction.stribeck", 1, (0.5,))]
-    found = fitted(TermEquations(store, terms))
+    found = TermEquations(store, terms).fitted()
     assert found[terms[1]][0] == 0.0
     assert found[terms[0]][0] > 0.0
 

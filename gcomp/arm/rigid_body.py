@@ -1,11 +1,11 @@
 """Rigid-body torque of an open chain of hinges, and its exact regressor in every link's ten inertial parameters.
 
-The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ rows take less than a second. It is checked
-against MuJoCo's `mj_inverse` when a model is loaded (`sim_gap.model.load`).
+The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ rows take less than a second. Whoever
+makes one of a MuJoCo model checks it against `mj_inverse`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -110,9 +110,6 @@ class RigidArm:
                 reach[j] = reach[before] + np.linalg.norm(self.offset[j])
         return reach
 
-    def with_inertial(self, inertial: Array) -> "RigidArm":
-        return replace(self, inertial=inertial)
-
     def torque(
         self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
     ) -> Array:
@@ -135,6 +132,10 @@ class RigidArm:
                 couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
         return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
 
+    def gravity_torque(self, q: Array, gravity: Array | None = None) -> Array:
+        """`torque` at rest."""
+        return self.torque(q, np.zeros_like(q), np.zeros_like(q), gravity)
+
     def link_regressor(self, motion: LinkMotion, link: int) -> Array:
         """Columns of `torque` in the ten inertial parameters of one link, (K, n, 10); zero where it is not carried."""
         turns, moves = motion
@@ -153,7 +154,7 @@ class RigidArm:
 
     def turn(self, joint: int, q: Array) -> Array:
         """Rotation of a link against the one before it, at its joint's positions (K,) [rad], (3, 3, K)."""
-        return _turned(self.rotation[joint], self.axis[joint], q - self.zero[joint])
+        return turned(self.rotation[joint], self.axis[joint], q - self.zero[joint])
 
     def motion(
         self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
@@ -222,12 +223,15 @@ def out_of_frame(turn: Array, vector: Array) -> Array:
     return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
 
-def _turned(start: Array, axis: Array, angle: Array) -> Array:
-    """Rotation `start` (3, 3) followed by angles (K,) about one axis (3,), by Rodrigues' formula, (3, 3, K)."""
+def turned(start: Array, axis: Array, angle: Array | float) -> Array:
+    """Rotation `start` (3, 3) followed by angles (K,) about one axis (3,), by Rodrigues' formula, (3, 3, K); by one
+    angle, (3, 3)."""
     x, y, z = axis
     hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine, versine = np.sin(angle), 1.0 - np.cos(angle)
     parts = start, start @ hat, start @ hat @ hat
+    if np.ndim(angle) == 0:
+        return np.asarray(parts[0] + parts[1] * sine + parts[2] * versine)
     return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
 
 
