@@ -5,6 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import numpy as np
+
+from armlink.arrays import Array
+from armlink.drives.board import Board
 from armlink.errors import ArmlinkError
 
 
@@ -92,7 +96,7 @@ class Result:
 ANSWER_CYCLES = 50
 """Cycles without power, to see whether each is answered."""
 ANSWERED = 0.9
-"""Share of them whose answer must come in its cycle; a busy host misses some."""
+"""Share of them that must be answered, in their cycle or late."""
 PATIENCE = 3.0
 """So many deadlines are waited for a reaction to a silent host."""
 HELD = 0.05
@@ -124,3 +128,28 @@ class Checks:
         """Joint and check of those without a result yet."""
         reached = {(each.joint, each.check) for each in self.results}
         return ((name, check) for check in checks for name in names if (name, check) not in reached)
+
+
+class Counted(Protocol):
+    """What takes in the readings of a link: it counts those of each joint."""
+
+    board: Board
+
+    def listen(self, seconds: float) -> object: ...
+
+
+def count_answers(loop: Counted, cycle: Callable[[], Array], cycles: int, period: float) -> list[tuple[bool, str]]:
+    """Whether each joint answers so many cycles of `period` [s], in time or late, and how many it did, in words.
+
+    `cycle` makes one and returns the positions (n,) that came in it, NaN where none did.
+    """
+    before = loop.board.came.copy()
+    in_time = np.sum([np.isfinite(cycle()) for _ in range(cycles)], axis=0)
+    if (in_time < cycles).any():
+        loop.listen(cycles * period)
+    found = []
+    for now, then, timely in zip(loop.board.came, before, in_time.tolist(), strict=True):
+        came = min(now - then, cycles)
+        late = f", {came - timely} of them late: this host, the bus or the drive is busy" if came > timely else ""
+        found.append((came >= ANSWERED * cycles, f"{came} of {cycles} cycles answered{late}"))
+    return found

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.drives.findings import ANSWER_CYCLES, ANSWERED, HELD, PATIENCE, Checks, Result
+from armlink.drives.findings import ANSWER_CYCLES, HELD, PATIENCE, Checks, Result, count_answers
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
@@ -150,13 +150,11 @@ class SelfTest:
                 self.checks.add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
         self._places()
         self._calibrations()
-        came = np.zeros(link.n, int)
-        for _ in range(ANSWER_CYCLES):
-            came += np.isfinite(link.commander.stand([Power.OFF] * link.n).position)
-        for joint, name in enumerate(link.names):
-            good = bool(came[joint] >= ANSWERED * ANSWER_CYCLES)
-            self.checks.judge(name, "answers", good, f"{came[joint]} of {ANSWER_CYCLES} cycles answered")
-        return bool((came >= ANSWERED * ANSWER_CYCLES).all())
+        off, commander = [Power.OFF] * link.n, link.commander
+        answers = count_answers(commander.loop, lambda: commander.stand(off).position, ANSWER_CYCLES, link.period)
+        for name, (good, found) in zip(link.names, answers, strict=True):
+            self.checks.judge(name, "answers", good, found)
+        return all(good for good, _ in answers)
 
     def _places(self) -> bool:
         """Whether each joint can stand where it reads; returns whether one cannot."""

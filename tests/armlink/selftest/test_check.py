@@ -1,6 +1,7 @@
 """The self-test: what it finds on a controller that does what it should, and on one that does not."""
 
 import json
+import re
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
 from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.drives.findings import HELD, Result
 from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest, announcement
@@ -62,8 +64,8 @@ def simulated():
     return SimulatedArm(arm, Truth.of(arm), 1)
 
 
-def self_test(simulated, power=True):
-    with Link(simulated.arm, LockStepBus(arm=simulated)) as link:
+def self_test(simulated, power=True, bus=LockStepBus):
+    with Link(simulated.arm, bus(arm=simulated)) as link:
         results = SelfTest(link).run(power)
     return {(each.joint, each.check): each for each in results}
 
@@ -85,6 +87,31 @@ def test_a_simulated_arm_passes_and_says_how_long_it_takes(simulated):
         assert "8130h" in alone.found
     simulated.advance(0.5)
     assert [node.value(0x6041) & 0x6F for node in simulated.nodes] == [QUICK_STOP] * 2
+
+
+class LateBus(LockStepBus):
+    """Of every third cycle the readings come a cycle late."""
+
+    syncs, late = 0, ()
+
+    def put(self, can_id, data):
+        if can_id == SYNC_ID:
+            self._outbox.extend(self.late)
+            self.late = ()
+            self.syncs += 1
+        super().put(can_id, data)
+        if can_id == SYNC_ID and self.syncs % 3 == 0:
+            self.late = [frame for frame in self._outbox if 0x180 < frame[0] < 0x200]
+            for frame in self.late:
+                self._outbox.remove(frame)
+
+
+def test_answers_that_come_late_are_answers():
+    arm = two_joints()
+    results = self_test(SimulatedArm(arm, Truth.of(arm), 1), bus=LateBus)
+    for joint in ("hinge_1", "hinge_2"):
+        assert results[joint, "answers SYNC"].outcome == "passed"
+        assert re.search(r"(\d+) of \1 cycles answered, 1\d of them late", results[joint, "answers SYNC"].found)
 
 
 def test_the_joints_do_not_move(simulated):

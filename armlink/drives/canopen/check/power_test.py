@@ -12,7 +12,7 @@ from armlink.drives.canopen.drives import CanopenDrives
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO2
 from armlink.drives.canopen.profile import LOST
-from armlink.drives.findings import ANSWER_CYCLES, ANSWERED, HELD, PATIENCE, Checks
+from armlink.drives.findings import ANSWER_CYCLES, HELD, PATIENCE, Checks, count_answers
 from armlink.drives.orders import Mode, Power
 from armlink.errors import ArmlinkError, BusFault, Refused
 
@@ -121,15 +121,13 @@ class PowerTest:
         """Cycles without power: readings in every one, the device's own heartbeat, the mode that is displayed."""
         link = self.link
         self._progress("readings, heartbeats and modes, without power")
-        off, came = [Power.OFF] * link.n, np.zeros(link.n, int)
+        off = [Power.OFF] * link.n
         self.drives.known.node_states.clear()
         beat = 2 * self.drives.protection.producer_ms * 1e-3
         cycles = max(ANSWER_CYCLES, int(np.ceil(beat / link.period)) + 1)
-        for _ in range(cycles):
-            came += np.isfinite(self._cycle(off).position)
-        for joint in range(link.n):
-            answered = bool(came[joint] >= ANSWERED * cycles)
-            self._tell(joint, "answers SYNC", answered, f"{came[joint]} of {cycles} SYNCs answered")
+        answers = count_answers(self.loop, lambda: self._cycle(off).position, cycles, link.period)
+        for joint, (answered, told) in enumerate(answers):
+            self._tell(joint, "answers SYNC", answered, told)
             heard = joint in self.drives.known.node_states
             found = (
                 f"heard, period {self.drives.protection.producer_ms} ms"
