@@ -74,7 +74,7 @@ class DaemonSection(Section):
         known = [field.name for field in fields(ObserverConfig)]
         for name in sorted(given):
             if name in FORMER_THRESHOLDS:
-                log.warning("daemon.observer.%s is no setting any more: left out", name)
+                log.warning("daemon.observer.%s is an obsolete setting and is ignored", name)
                 del given[name]
             elif name not in known:
                 raise ValueError(f"there is no threshold {name!r}; there are {', '.join(known)}")

@@ -205,7 +205,7 @@ def test_a_silent_arm():
     bench.arm.outbox.clear()
     bench.simulated[4].unplugged = True
     assert [each.present for each in bench.drives.identify(bench)] == [True] * 4 + [False, True]
-    with pytest.raises(BusFault, match="wrist_2: nothing is heard of joint 5"):
+    with pytest.raises(BusFault, match="wrist_2: no message from joint 5"):
         bench.set_up()
 
 
