@@ -111,11 +111,11 @@ def test_torque_and_position_are_bounded_in_size_and_rate():
 
         most, step = round(MAX_TORQUE / RATED * 1000), SPEED / UNIT
         assert "target torque of joint_1 is 751, allowed are -750 to 750" in refused(751, 0)
-        assert "at once" in refused(most, 0)
+        assert "in one frame" in refused(most, 0)
         assert "target position of joint_1" in refused(50, int(WINDOW) + 2)
-        assert "at once" in refused(50, int(0.1 * step))
+        assert "in one frame" in refused(50, int(0.1 * step))
         assert refused(50, int(0.015 * step)) == ""
-        assert "at once" in refused(50, int(0.030 * step), 0.001)
+        assert "in one frame" in refused(50, int(0.030 * step), 0.001)
         assert refused(50, int(0.024 * step), 0.012) == ""
 
 
