@@ -66,11 +66,11 @@ def external(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Tell what torque neither arm, tool nor friction explains, with 95 % bounds, and what touches the arm.
+    """Estimate the torque that arm, tool and friction do not explain, with 95 % bounds, and report contacts.
 
-    Without recordings it listens to the arm while another program runs it, sends nothing, and tells until Ctrl-C;
-    with --json a line for each row and event. Exit status 3 if nothing is heard. Without --baseline or --learned, the
-    bounds of recordings come from the arm's records alone.
+    Without recordings, listen until Ctrl-C to an arm that another program runs, and send nothing; with --json, write a
+    line for each row and event. Exit status 3 if nothing is heard. Without --baseline or --learned, the bounds of
+    recordings come from the arm's records alone.
 
     Example: armlink external arm.yaml run.mcap --baseline free.mcap
     """
