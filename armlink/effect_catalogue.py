@@ -63,7 +63,7 @@ _ENTRIES = (
     ),
     CatalogueEntry(
         "friction.bearing",
-        "friction on the link side of the torque sensor, as of bearings and seals",
+        "friction of bearings and seals on the link side of the torque sensor",
         (Parameter("torque", "N·m"), Parameter("damping", "N·m·s/rad")),
     ),
     CatalogueEntry("friction.coulomb", "Coulomb friction, independent of speed", (Parameter("torque", "N·m"),)),

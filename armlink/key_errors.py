@@ -61,7 +61,7 @@ def _short(value: typing.Any) -> str:
     try:
         text = repr(value)
     except ValueError:  # a number of more digits than Python writes
-        return "a number of very many digits"
+        return "a number with too many digits"
     return text if len(text) <= 100 else f"{text[:100]}…"
 
 

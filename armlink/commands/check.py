@@ -50,8 +50,8 @@ def check(
 ) -> int:
     """Check identity, set-up and calibration of the drives; then, with power, what they do without their host.
 
-    The command shows that each drive stops by itself when its host falls silent, and how long that takes. It first says
-    what it will do to the joints and asks, except with --yes or on a simulated arm in this process. At the end the
+    The command tests whether each drive stops by itself when its host falls silent, and how long that takes. It first
+    says what it will do to the joints and asks, except with --yes or on a simulated arm in this process. At the end the
     joints hold, in quick stop, or the arm is parked or lowered. Exit status 1 if a check fails.
 
     With --host nothing is sent: this machine makes cycles at the rate of the arm while another process computes. Exit

@@ -9,7 +9,7 @@ from armlink.errors import Stall
 
 HOLD = "the joints hold where they stand, in quick stop"
 PARKED = (
-    "unless a line above reports a fault, the arm was parked or slowly lowered, and then its power was switched off"
+    "the arm was parked or slowly lowered, and then its power was switched off, unless a line above reports a fault"
 )
 
 

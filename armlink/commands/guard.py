@@ -17,7 +17,7 @@ def guard(
     """Write the policy of a guard of this arm's bus: which frames may pass, with bounds of torque and position.
 
     The drives are read for their scales and objects; nothing is set. The guard itself is one file without dependencies:
-    it has the bus of the arm for itself and gives programs another interface, whose frames it checks one by one.
+    only the guard uses the bus of the arm; programs use another interface, and the guard checks each of their frames.
 
     Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
     """

@@ -351,7 +351,7 @@ class BasicDrives(Generic[M]):
         """
         raise BadInput(
             f"{self.names[0]}: a guard cannot check frames to {self.settings[0].family} drives: the bytes "
-            "alone do not show what a frame orders"
+            "alone do not show what a frame commands"
         )
 
     def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:

@@ -78,7 +78,7 @@ class BusDrives:
             if family(name).traits.frame == "fd" and not searched.fd:
                 lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
             if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
-                lack = f"requests to them could command the {beside.pop()} drives, or be taken for their frames"
+                lack = f"requests to them could command the {beside.pop()} drives, or look like their frames"
             if lack:
                 lacking.setdefault(lack, []).append(name)
                 continue

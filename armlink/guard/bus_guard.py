@@ -110,10 +110,10 @@ class Field:
         if self._last is None:
             if value in self.first:
                 return ""
-            return f"{self.name} is {value} in a frame that gives power, but no reading shows the joint near it"
+            return f"{self.name} is {value} in a frame that gives power, but no reading of the joint is near it"
         if abs(value - self._last) <= self._room_at(now):
             return ""
-        return f"{self.name} goes from {self._last} to {value} at once, but may change by {self._room_at(now):g} only"
+        return f"{self.name} changes from {self._last} to {value} in one frame, limit {self._room_at(now):g}"
 
     def _inwards(self, value: float, began: list[float]) -> bool:
         """Whether a number outside the range is no further out than one of these, where the joint stands or was led."""
@@ -292,8 +292,8 @@ class Policy:
             )
         if not frame.after <= self._acknowledged:
             return (
-                f"the program sent {can_id:X}h, but since the drive or the guard started, the drive has not "
-                "acknowledged the settings that give this frame its meaning: set up the arm again"
+                f"the program sent {can_id:X}h, but the drive has not acknowledged the settings of this frame "
+                "since it or the guard started: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:
@@ -441,19 +441,16 @@ class BusGuard:
     def _tell_late(self, age: float) -> None:
         """The drives have stopped by themselves meanwhile; what the program said before counts no more."""
         if not self._late:
-            self._say(
-                f"guard: it is late: frames that are {age:.3f} s old are not passed, the limit is "
-                f"{self.policy.deadline:g} s"
-            )
+            self._say(f"guard: frames that are {age:.3f} s old are dropped, limit {self.policy.deadline:g} s")
         self._late = True
 
     def close(self, why: str) -> None:
         """Stop the joints and pass nothing more."""
         self.closed = why
         told = [self.wire.send(can_id, data) for can_id, data in self.policy.stop]
-        then = "the joints were told to stop"
+        then = "the joints were commanded to stop"
         if not all(told):
-            then = "the joints could not be told to stop, so they stop when their drives notice the silence"
+            then = "the stop commands could not be sent: the joints stop when their drives miss the host"
         self._say(f"guard: closed, it passes no more frames: {why}; {then}; start the guard again to open it")
 
 
@@ -495,7 +492,7 @@ def main(words: list[str]) -> int:
         with open(path, encoding="utf-8") as file:
             policy = Policy(json.load(file))
     except (OSError, ValueError, RecursionError, PolicyError) as error:
-        _say(f"guard: {path}: {error}; `armlink guard --help` tells how to write this file")
+        _say(f"guard: {path}: {error}; `armlink guard --help` describes how to write this file")
         return 2
     ports = []
     for name in (program, wire):
@@ -523,7 +520,7 @@ def main(words: list[str]) -> int:
                 guard.close(f"an interface failed ({error.strerror})")
             time.sleep(0.2)
     if not guard.closed:
-        guard.close("the guard was told to end")
+        guard.close("the guard was ended by a signal")
     return 0
 
 

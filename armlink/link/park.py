@@ -69,7 +69,7 @@ def require_deadman(link: Parked) -> None:
         if each.reaction(link.section.keeper) == "keeps on":
             instead = ", or set `link.keeper: true` (docs/safety.md, keeper)" if each.kept else ""
             raise Refused(
-                f"{name}: if this host dies, the drive goes on with its last command (`silence: keeps on`), so "
+                f"{name}: if this host dies, the drive continues its last command (`silence: keeps on`), so "
                 "this joint is not enabled: choose a firmware or a setting with which the drive monitors its "
                 f"host{instead}"
             )

@@ -41,13 +41,13 @@ def announcement(arm: ArmFile) -> str:
         told = "; ".join(f"{', '.join(names)}: {drive}" for drive, names in drives.items())
         steps = (
             f"One joint after the other then gets no commands for up to {PATIENCE * deadline:.0f} ms, until its drive "
-            f"reacts. By the traits of the drives, {told}. A joint whose drive does not report its state is "
-            f"turned by {LEAN} rad before that."
+            f"reacts. The expected reactions are: {told}. A joint whose drive does not report its state is first "
+            f"turned by {LEAN} rad."
         )
         if any(each.silence != each.reaction(keeper) for each in traits):
             steps += (
-                f" Last, no joint gets commands for {PATIENCE * deadline:.0f} ms, in which the keeper must hold those "
-                "whose drives keep on."
+                f" Last, no joint gets commands for {PATIENCE * deadline:.0f} ms: the keeper must hold every joint "
+                "whose drive keeps on."
             )
     end = "the joints hold, in quick stop"
     if not all(each.silence == "holds" for each in traits):

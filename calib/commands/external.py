@@ -21,7 +21,7 @@ def external(
     arm: ArmOrModel,
     stated: "Corrections",
     recordings: Annotated[
-        list[str] | None, typer.Argument(help="Recordings to judge; without, the arm is listened to.")
+        list[str] | None, typer.Argument(help="Recordings to judge; by default listen to the arm.")
     ] = None,
     baseline: Annotated[
         list[str] | None,
@@ -45,8 +45,8 @@ def external(
     learned: Annotated[
         Path | None,
         typer.Option(
-            help="Keep what is learned from --baseline in this file (.npz); without --baseline, take it from there. "
-            "The daemon reads external.npz of its state directory."
+            help="Write what is learned from --baseline to this file (.npz); without --baseline, read this file. "
+            "The daemon reads external.npz in its state directory."
         ),
     ] = None,
     bus: OtherBus = None,
@@ -58,7 +58,7 @@ def external(
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to listen [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     picture: Annotated[
-        Path | None, typer.Option(help="Draw the smallest force that is felt over the workspace (SVG).")
+        Path | None, typer.Option(help="Draw the smallest detectable force over the workspace (SVG).")
     ] = None,
     base: ChainBase = None,
     tip: ChainTip = None,
@@ -66,11 +66,11 @@ def external(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Tell what torque neither arm, tool nor friction explains, with 95 % bounds, and what touches the arm.
+    """Estimate the torque that arm, tool and friction do not explain, with 95 % bounds, and report contacts.
 
-    Without recordings it listens to the arm while another program runs it, sends nothing, and tells until Ctrl-C;
-    with --json a line for each row and event. Exit status 3 if nothing is heard. Without --baseline or --learned, the
-    bounds of recordings come from the arm's records alone.
+    Without recordings, listen until Ctrl-C to an arm that another program runs, and send nothing; with --json, write a
+    line for each row and event. Exit status 3 if nothing is heard. Without --baseline or --learned, the bounds of
+    recordings come from the arm's records alone.
 
     Example: armlink external arm.yaml run.mcap --baseline free.mcap
     """
@@ -96,11 +96,11 @@ def external(
             f"external: {source} and {recordings[0] if recordings else picture}: give recordings or a live source"
         )
     if not listens and (foxglove is not None or seconds):
-        raise BadInput("external: --foxglove and --seconds belong to listening, which is done without recordings")
+        raise BadInput("external: --foxglove and --seconds are for listening: leave the recordings out")
     if listens and not (learned or baseline):
         raise BadInput(
-            "external: give recordings to judge, or --picture FILE.svg for the smallest force that is felt; to listen "
-            "to the arm give --learned FILE or --baseline RECORDING"
+            "external: give recordings, or --picture FILE.svg for a map of the smallest detectable force; to listen "
+            "to the arm, give --learned FILE or --baseline RECORDING"
         )
     if out is not None:
         require_writable(out)
@@ -133,7 +133,7 @@ def external(
         from calib.commands.external_live import follow
 
         if records.stated.arm_file is None:
-            raise BadInput(f"{arm}: listening needs an arm file, which says how; `armlink new` makes one")
+            raise BadInput(f"{arm}: listening needs an arm file, which `armlink new` makes")
         follow(records.stated.arm_file, source, Learned(listener, place, per_hour), seconds, json_file, foxglove)
         return
     every: list[tuple[str, Array, list[Heard]]] = []
@@ -147,7 +147,7 @@ def external(
     for label, recording in judged.items():
         heard = list(listen(listener, recording, place, per_hour))
         if not heard:
-            raise BadInput(f"{label}: it has no {SHORTEST:g} s without missing rows, but needs them: record for longer")
+            raise BadInput(f"{label}: it has no {SHORTEST:g} s without missing rows: record for longer")
         every.append((label, recording.t, heard))
         answers.append(answer_of(label, heard, names))
         _tell(console, answers[-1], names)
@@ -242,7 +242,7 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
     console.print(table)
     best, worst = ("not determined" if force is None else f"{force:.1f} N" for force in answer["smallest_force"])
     console.print(
-        f"{answer['seconds']:.1f} s judged. Smallest force at the frame that is found in 95 %: {best} along the best "
+        f"{answer['seconds']:.1f} s judged. Smallest force at the frame, found in 95 % of cases: {best} along the best "
         f"direction, {worst} along the worst"
     )
     for event in answer["events"]:

@@ -65,8 +65,8 @@ def follow(
                 show(live, newest, first)
     if heard and not rows:
         raise BusFault(
-            f"{heard} samples of {arm.name} were heard, but no second of them with positions and "
-            f"{learned.listener.channel} of all joints, which this was learned of"
+            f"{heard} samples of {arm.name} were heard, but in no second had all joints both position and "
+            f"{learned.listener.channel}, which the learned model needs"
         )
     if newest is not None and out.is_terminal:
         out.print(_table(live, newest, first))

@@ -60,7 +60,7 @@ def identify(
         Path | None, typer.Option(help="Also write base parameters as YAML for ROS 2.", rich_help_panel=POSES)
     ] = None,
     plan: Annotated[
-        int, typer.Option(min=0, max=100, help="Also name so many further poses.", rich_help_panel=POSES)
+        int, typer.Option(min=0, max=100, help="Also list this many further poses.", rich_help_panel=POSES)
     ] = 0,
     store: Store = None,
     json_file: JsonFile = None,
@@ -87,7 +87,7 @@ def identify(
     of_poses = PoseOptions(base, tip, masses, held, gain_std, out_model, coefficients, plan)
     if model is not None:
         if arm is not None or calibration is not None:
-            raise BadInput("--arm, --calibration: only for sweeps; poses need --model alone")
+            raise BadInput("--arm, --calibration: only for sweeps; poses need only --model")
         return identify_poses(data, model, of_poses, stated, records, json_file)
     of_poses.require_none()
     sweeps, arm_file = load_sweeps(data, arm)

@@ -32,7 +32,7 @@ def observe(
 ) -> int:
     """Compare the torques of an arm at work with its calibration and gravity record; exit status 1 for a change.
 
-    It listens as the daemon does, and only tells: nothing is written or proposed. Exit status 3 if nothing is heard.
+    It listens like the daemon and only reports: nothing is written or proposed. Exit status 3 if nothing is heard.
 
     Example: armlink observe arm.yaml --ros2 /joint_states --seconds 600
     """

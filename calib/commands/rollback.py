@@ -67,5 +67,5 @@ def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", r
     if record != records.current(CalibrationRecord, arm_file):  # the current one may be written once more
         records.former(arm_file, to)
     written = apply_rollback(record, arm_file, records, how, reason)
-    gate = "of a roll-back only one thing is checked: how far its values are from those that the drives held before"
+    gate = "a roll-back has one check: the distance of its values from the values that the drives held before"
     results().print(f"written to {len(written)} drives and read back; {gate}")

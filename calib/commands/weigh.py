@@ -24,7 +24,7 @@ def weigh(
 ) -> None:
     """Drive to poses and weigh the tool or payload that the arm carries, beyond its gravity record.
 
-    The arm must have been calibrated and identified. What the arm file declares as `tool` is weighed, too.
+    The arm must have been calibrated and identified. A declared `tool` is weighed, too.
 
     Example: armlink weigh sarcos --bus socketcan:vcan0 --json -
     """

@@ -90,7 +90,7 @@ def turn_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             "after power-on, the drives of these joints may count one turn too many or too few, and the "
             f"reading may still lie between the stops: {', '.join(found)}",
             f"{arm_file.path}: link.joints",
-            "armlink cannot detect this error: use an encoder that knows its turn, or check the reading of "
+            "armlink cannot detect this error: use a multi-turn encoder, or check the reading of "
             "such a joint after each power-on, before it moves",
         )
 
@@ -109,8 +109,8 @@ def silence_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             "warning",
             f"if the host dies, the drives of these joints keep on with their last command: {', '.join(found)}",
             f"{arm_file.path}: link.joints",
-            "armlink reads them and gives them no power: state the time-out that is set in them, where they have one "
-            "(docs/drive-families.md), else set `link.keeper: true` (docs/safety.md)",
+            "armlink reads these drives but never enables them: state the time-out that is set in each, if there is "
+            "one (docs/drive-families.md), or set `link.keeper: true` (docs/safety.md)",
         )
 
 

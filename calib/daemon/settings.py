@@ -73,7 +73,7 @@ class DaemonSection(Section):
         if not isinstance(given, dict):
             return given
         for name in sorted(FORMER_THRESHOLDS & given.keys()):
-            log.warning("daemon.observer.%s is no setting any more: left out", name)
+            log.warning("daemon.observer.%s is an obsolete setting and is ignored", name)
         return {name: value for name, value in given.items() if name not in FORMER_THRESHOLDS}
 
 

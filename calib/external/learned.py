@@ -56,7 +56,7 @@ def load_learned(path: Path, records: ArmRecords) -> Learned:
         if str(content["schema"]) != SCHEMA:
             raise BadInput(f"{path}: schema is {content['schema']}, expected {SCHEMA}: learn again with --baseline")
         if tuple(content["names"].tolist()) != arm.names or tuple(content["records"].tolist()) != _ids(records):
-            raise BadInput(f"{path}: was learned of another arm, or with other records: learn again with --baseline")
+            raise BadInput(f"{path}: was learned from another arm or other records: learn again with --baseline")
         spreads = [Spread(*(content[f"{spread}_{name}"] for name in OF_SPREAD)) for spread in SPREADS]
         maxima = content["maxima_0"], content["maxima_1"]
         links, joints, factors, scale = (content[name] for name in ARRAYS)
@@ -66,7 +66,7 @@ def load_learned(path: Path, records: ArmRecords) -> Learned:
         listener = ArmListener(model, records, str(content["channel"]), float(content["rate"]), content.get("warm"))
         return Learned(listener, WrenchFrame(int(content["link"]), content["point"]), float(content["per_hour"]))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise BadInput(f"{path}: cannot be read as what --learned has written: {error}") from None
+        raise BadInput(f"{path}: is not a file that --learned has written: {error}") from None
 
 
 def _ids(records: ArmRecords) -> tuple[str, str]:

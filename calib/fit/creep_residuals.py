@@ -197,8 +197,8 @@ def springs(
         pull = abs(value) * float(np.ptp(own)) if own.size else 0.0
         if pull > LEAST_PULL * rated[joint] and abs(value) > SIGNIFICANCE * std[joint]:
             text = (
-                f"{name}: something pulls by {value:+.2f} N·m/rad of its position in all its sweeps: a cable under"
-                " tension or a spring; free it and sweep again"
+                f"{name}: a spring of {value:+.2f} N·m/rad acts in all its sweeps: free the cable or spring, and "
+                "sweep again"
             )
             named.append(FitFinding(name, "spring", value, "N·m/rad", text))
     return tuple(named)

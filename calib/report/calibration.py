@@ -278,7 +278,7 @@ def write_verification(
     skipped = f" {result.skipped} poses were skipped, since the drives cannot reach them." if result.skipped else ""
     html = verdict_line(verdict) + paragraph(
         f"Gravity record {gravity.id} compared with the torque sensors with {sensors}, at "
-        f"{len(result.sensor)} random poses that were used for no fit.{skipped}"
+        f"{len(result.sensor)} random poses that no fit used.{skipped}"
     )
     header = (
         "joint",

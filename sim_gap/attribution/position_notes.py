@@ -45,7 +45,7 @@ def notes(found: Identified) -> list[str]:
     if found.search.resting:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
         assumed = (
-            "the model assumes that a controller holds them still"
+            "they are assumed to be held still by a controller"
             if found.search.open_controller
             else "the values of the model are kept"
         )

@@ -104,7 +104,7 @@ def run_bench(
     """
     _require_range(effects)
     if positions and effects:
-        raise BadInput(f"--effects {effects}: cases of positions alone have at most one effect: leave this option out")
+        raise BadInput(f"--effects {effects}: cases without torque have at most one effect: leave this option out")
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):

@@ -66,7 +66,7 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
     evidence = (
         f"the time steps scatter by {scatter * 1e3:.1f} ms, and with even steps of "
         f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
-        f"{before / max(after, 1e-12):.1f} times smoother: t is when rows were received, not measured"
+        f"{before / max(after, 1e-12):.1f} times smoother: t is the time of receipt, not of measurement"
     )
     values = {**vars(recording), "t": sampled}
     return Recording(**values), [

@@ -123,9 +123,9 @@ def show(result: Mapping[str, Any], console: "Console") -> None:
 
 def show_positions(result: Mapping[str, Any], console: "Console") -> None:
     console.print(
-        f"{_counted(result)}; {result['answers']} answers, {result['tellable']} of them on one effect that can be "
-        f"identified: right first or confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
-        f"{_percent(result['false_confident'])}, false alarms without an effect "
+        f"{_counted(result)}; {result['answers']} answers, {result['tellable']} of them to one identifiable effect. "
+        f"Right first or confounded: {_percent(result['named_where_tellable'])}; a false cause above 0.8: "
+        f"{_percent(result['false_confident'])}; false alarms without an effect: "
         f"{_percent(result['label_withheld']['no_effect']['false_alarms'])}"
     )
     _show_effects(result, console)

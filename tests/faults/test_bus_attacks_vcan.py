@@ -11,16 +11,16 @@ from bus_attacks import BARE, GUARDED, Scene, link, scene
 
 pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py`
 
-OWN_WATCHES = "the joints could not be told to stop, so they stop when their drives notice the silence"
+OWN_WATCHES = "the stop commands could not be sent: the joints stop when their drives miss the host"
 CLOSED = {
     "killed": "",
     "command on the wire": "20Bh came on the wire and is not from this guard: another host commands the drives there",
-    "suspended": "it is late: frames",
+    "suspended": "s old are dropped",
     "a second guard": "came on the wire and is not from this guard: another host|which only a drive may send|"
     "which the policy does not name",
     "wire down and up": rf"an interface failed \(Network is down\); {OWN_WATCHES}|the wire takes no frames",
     "killed and started again at once": "",
-    "its terminal is closed": "the guard was told to end; the joints were told to stop",
+    "its terminal is closed": "the guard was ended by a signal; the joints were commanded to stop",
     "flood of SYNCs by a program": "80h: is sent more often than 100 times a second",
     "SYNC as CAN FD by a program": "the program sent 80h as CAN FD, but by the policy (`fd`) this bus carries only "
     "classical CAN",
@@ -80,4 +80,4 @@ def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> N
     assert not found.wrong, found
     assert re.search("No such device|Network is down", found.host), found.host
     assert "guard: closed, it passes no more frames: an interface failed (" in found.guard
-    assert "the joints were told to stop" in found.guard
+    assert "the joints were commanded to stop" in found.guard

@@ -194,7 +194,7 @@ class ListeningBus(InProcessBus):
     def silence(self) -> str:
         """Why no joint of the arm is heard, in one line."""
         if self._open:
-            return "; ".join((f"no message comes any more: {self._source.absence()}", *self.said()))
+            return "; ".join((f"messages have stopped: {self._source.absence()}", *self.said()))
         if self._foreign:
             named, ours = list(self._foreign), ", ".join(self._place)
             more = f" and {len(named) - MOST_FOREIGN} others" if len(named) > MOST_FOREIGN else ""
@@ -283,7 +283,7 @@ class ListeningBus(InProcessBus):
         if not message.position:
             self._remark("messages have no position")
         elif not message.effort:
-            self._remark("messages have no effort: there is no torque")
+            self._remark("messages have no effort, so there is no torque")
         if not math.isfinite(position):
             return []
         return [(READING_ID + self._place[name], READING.pack(position, velocity, effort))]

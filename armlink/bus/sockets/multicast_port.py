@@ -65,9 +65,7 @@ class MulticastPort(DatagramPort):
 
     def _full(self) -> BusFault:
         """No node has a part in it: the datagrams loop back within this machine."""
-        return Stall(
-            f"bus {self._name}: this machine accepted no datagrams for 50 ms: too many other programs run on it"
-        )
+        return Stall(f"bus {self._name}: this machine accepted no datagrams for 50 ms: stop other programs on it")
 
     def _take(self) -> Frame | None:
         return self._decoded(*self._receiving.recvfrom(LONGEST + 1, socket.MSG_DONTWAIT))

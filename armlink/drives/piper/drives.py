@@ -151,8 +151,8 @@ class PiperDrives(MitDrives[PiperMemory]):
                 )
             if known.state is not None and known.state & PiperState.ENABLED:
                 raise Refused(
-                    f"{self.names[joint]}: it has power: another host drives the arm, or it is held since its host "
-                    "died, and would fall without power: support the arm, then switch its power off and on"
+                    f"{self.names[joint]}: it has power: another host drives the arm, or its host died and the drives "
+                    "still hold it: support the arm, which falls without power, then switch its power off and on"
                 )
         return super().set_up(ask, limits)
 
@@ -160,8 +160,8 @@ class PiperDrives(MitDrives[PiperMemory]):
         known, settings = self.memory[joint], self.settings[joint]
         if known.state is None or not math.isfinite(known.position):
             raise BusFault(
-                f"{self.names[joint]}: nothing is heard of {settings.address}: check that the arm is powered, and that "
-                "it is no master arm, which is silent while nobody moves it"
+                f"{self.names[joint]}: no message from {settings.address}: check that the arm is powered and is not a "
+                "master arm (a master arm is silent while nobody moves it)"
             )
         grid = self.grid_of(joint)
         self.require_window(joint, limits, grid)
@@ -280,7 +280,7 @@ class PiperDrives(MitDrives[PiperMemory]):
     def own_stop(self, joint: int) -> str:
         if not self.memory[joint].stopped:
             return ""
-        return f"{self.where(joint)}: no command came within the deadline, after which its keeper holds it"
+        return f"{self.where(joint)}: no command came within the deadline, so its keeper holds it"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)

@@ -63,7 +63,7 @@ ARM_FAULTS = {
     5: "no communication with a joint",
     6: "the brake of a joint is closed",
     7: "collision",
-    8: "overspeed while it was led by hand",
+    8: "overspeed in hand guiding",
     9: "a joint has a fault",
     14: "controller too hot",
     15: "brake resistor too hot",

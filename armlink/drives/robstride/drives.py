@@ -61,7 +61,7 @@ class RobStrideSettings(DriveSettings):
     def _gains_fit_the_model(self) -> "RobStrideSettings":
         ranges = RANGES[self.model]
         if self.kp > ranges.kp or self.kd > ranges.kd:
-            raise ValueError(f"kp {self.kp}, kd {self.kd}: {self.model} has kp up to {ranges.kp}, kd up to {ranges.kd}")
+            raise ValueError(f"kp {self.kp}, kd {self.kd}: the {self.model} has at most {ranges.kp} and {ranges.kd}")
         return self
 
     @property

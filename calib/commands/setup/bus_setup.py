@@ -32,7 +32,7 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
         opened.shutdown()
     arm = parse_arm(parse_yaml(made.text, out), out)
     write_whole(out, made.text)
-    return _tell(out, arm, made.matches, "; the geometry is not known, as the file says", [], json_file)
+    return _tell(out, arm, made.matches, "; the geometry is not known (see the file)", [], json_file)
 
 
 def rewire(

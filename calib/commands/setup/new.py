@@ -79,7 +79,7 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     json_file: JsonFile = None,
 ) -> int:
-    """Write an arm file that demo, sweep and check take as it is.
+    """Write an arm file that demo, sweep and check accept unchanged.
 
     The arm is the longest chain of revolute joints. Gripper, mimic and prismatic joints at its end are not part of it,
     nor are joints that carry --base or that --lock names. Limits and torques are taken from the model. What the model

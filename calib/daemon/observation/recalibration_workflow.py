@@ -190,7 +190,7 @@ class RecalibrationWorkflow:
 
         def kept() -> None:
             if not self._has(row):
-                gone = f"there is no proposal {number} any more: the journal was damaged and begun anew"
+                gone = f"there is no proposal {number} any more: the journal was damaged and replaced"
                 answer.set_exception(NoSuch(gone))
                 return
             then()

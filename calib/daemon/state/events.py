@@ -118,13 +118,11 @@ _EFFECTS = {
 _OF_MOTORS = {
     "gain": (
         "drift",
-        "its drive reads {change:+.1%} ± {std:.1%} more torque: measure its torque constant anew, with creep "
-        "sweeps, when the arm is free for them",
+        "its drive reads {change:+.1%} ± {std:.1%} more torque: measure its torque constant again, with creep sweeps",
     ),
     "offset": (
         "drift",
-        "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset anew, "
-        "with creep sweeps, when the arm is free for them",
+        "its drive reads {change:+.3f} ± {std:.3f} N·m without torque: measure this offset again, with creep sweeps",
     ),
     "friction": ("effect", "its friction has changed by {change:+.0%} ± {std:.0%}"),
 }
@@ -200,7 +198,7 @@ def _load(cause: str, evidence: dict[str, Any]) -> str:
         else "the load stays, so it counts as a tool and is part of the model from now on"
     )
     if mass is None:
-        return f"payload of unknown mass, since the distances between the axes do not show its mass; {held}"
+        return f"payload of unknown mass, since the joint axes are too close together; {held}"
     if mass < 0:
         return f"{-mass:.3f} kg were removed at ({place}) m in the frame of the last link"
     return f"payload of {mass:.3f} kg at ({place}) m in the frame of the last link; {held}"

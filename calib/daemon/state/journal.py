@@ -218,7 +218,7 @@ class Journal:
         newest = "SELECT COALESCE(MAX(id), 0) FROM "
         event, proposal = (int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals"))
         if max(event, proposal) > LARGEST_ROW:
-            raise sqlite3.DatabaseError("malformed: an id that nobody gave")
+            raise sqlite3.DatabaseError("malformed: an unknown id")
         if not self._next_event:
             self._belief = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
         # ids go on where a file is begun anew, or another one takes its place, under way

@@ -82,9 +82,9 @@ def heavy_rotor(scene: Scene, j: int) -> dict[str, Any]:
 def offset_twin(scene: Scene, j: int) -> dict[str, Any]:
     """Effects that do the same as an offset of the first or last joint's angle, as fields of DrawnEffect."""
     if j == 0:
-        return {"undecided": "of joint 1: base tilt does the same", "confused_with": ("base.tilt",)}
+        return {"undecided": "at joint 1 a base tilt has the same effect", "confused_with": ("base.tilt",)}
     if j == scene.arm.n - 1:
-        why = "of the last joint: its mass moment does the same"
+        why = "at the last joint a mass moment has the same effect"
         return {"undecided": why, "confused_with": ("link.mass_moment",)}
     return {}
 

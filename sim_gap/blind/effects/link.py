@@ -13,7 +13,7 @@ from sim_gap.blind.scene import Scene, rms
 XYZ = ("x", "y", "z")
 LEAST_WEIGHT_SHARE = 0.1
 """Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
-UPRIGHT = "the axis is upright: a moved mass shows by its inertia alone"
+UPRIGHT = "the axis is vertical: a moved mass shows only in its inertia"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
 

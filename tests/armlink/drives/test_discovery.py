@@ -193,7 +193,7 @@ def test_beside_a_family_that_its_requests_command_none_is_asked(tmp_path, monke
     wired(tmp_path, "six-odrive", change)
     found, told = scanned(capsys)
     assert [each["address"] for each in found] == [f"node {48 + place}" for place in range(6)]
-    assert re.search(r"not for .*canopen.* \(requests to them could command the odrive drives, or be taken for", told)
+    assert re.search(r"not for .*canopen.* \(requests to them could command the odrive drives, or look like", told)
     assert not [can_id for can_id, _ in sent if can_id == 0x7FF or 0x601 <= can_id <= 0x67F]
 
 

@@ -205,7 +205,7 @@ def test_a_silent_arm():
     bench.arm.outbox.clear()
     bench.simulated[4].unplugged = True
     assert [each.present for each in bench.drives.identify(bench)] == [True] * 4 + [False, True]
-    with pytest.raises(BusFault, match="wrist_2: nothing is heard of joint 5"):
+    with pytest.raises(BusFault, match="wrist_2: no message from joint 5"):
         bench.set_up()
 
 
@@ -215,7 +215,7 @@ def test_without_a_keeper_it_gets_no_power():
     simulated = SimulatedArm(arm, Truth.of(arm))
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
-        with pytest.raises(Refused, match=r"base: if this host dies, the drive goes on .* `link.keeper: true`"):
+        with pytest.raises(Refused, match=r"base: if this host dies, the drive continues .* `link.keeper: true`"):
             link.enable()
     assert not any(simulated.device(joint).motor.powered for joint in range(6))
 

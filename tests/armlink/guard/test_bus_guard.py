@@ -111,11 +111,11 @@ def test_torque_and_position_are_bounded_in_size_and_rate():
 
         most, step = round(MAX_TORQUE / RATED * 1000), SPEED / UNIT
         assert "target torque of joint_1 is 751, allowed are -750 to 750" in refused(751, 0)
-        assert "at once" in refused(most, 0)
+        assert "in one frame" in refused(most, 0)
         assert "target position of joint_1" in refused(50, int(WINDOW) + 2)
-        assert "at once" in refused(50, int(0.1 * step))
+        assert "in one frame" in refused(50, int(0.1 * step))
         assert refused(50, int(0.015 * step)) == ""
-        assert "at once" in refused(50, int(0.030 * step), 0.001)
+        assert "in one frame" in refused(50, int(0.030 * step), 0.001)
         assert refused(50, int(0.024 * step), 0.012) == ""
 
 
@@ -337,7 +337,7 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
     assert lines == [
         "guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; "
-        "the joints were told to stop; start the guard again to open it"
+        "the joints were commanded to stop; start the guard again to open it"
     ]
     guard._to_program(0x181, bytes(8), False)
     assert program.sent == [(0x181, bytes(8))]
@@ -589,7 +589,7 @@ def test_main_passes_frames_until_it_is_told_to_end_and_stops_the_joints(wires, 
     assert all_heard(program) == [(0x181, b"12345678", 0, 16)]
     first, second = capfd.readouterr().err.splitlines()
     assert first == f"guard: arm0 may command can0 as {tmp_path / 'policy.json'} allows"
-    assert second.startswith("guard: closed, it passes no more frames: the guard was told to end; ")
+    assert second.startswith("guard: closed, it passes no more frames: the guard was ended by a signal; ")
 
 
 def test_main_closes_once(wires, monkeypatch, tmp_path, capfd):
@@ -623,7 +623,7 @@ def test_a_frame_that_waited_for_longer_than_the_drives_wait_for_their_host_goes
     assert wire.sent == []
     assert not guard.closed
     assert len(lines) == 1
-    assert lines[0].startswith("guard: it is late: frames that are 3.0")
+    assert lines[0].startswith("guard: frames that are 3.0")
     guard._to_wire(0x80, b"", False, time.monotonic())
     assert wire.sent == [(0x80, b"")]
 
@@ -634,7 +634,7 @@ def test_a_reading_counts_from_when_it_came():
     for can_id, data, then in HEARD:
         guard._to_program(can_id, data, False, now - 10.0 + then - ENABLED_AT)
     guard._to_wire(0x201, COMMAND.pack(0x0F, 50, 0), False, now)
-    assert "in a frame that gives power, but no reading shows the joint" in guard.closed
+    assert "in a frame that gives power, but no reading of the joint" in guard.closed
 
 
 @pytest.mark.parametrize(
@@ -749,9 +749,9 @@ def test_lost_frames_close_it(wires, side, name):
 def test_a_stop_that_did_not_leave_is_not_told_as_one():
     guard, _, wire, lines = opened()
     wire.full = True
-    guard.close("the guard was told to end")
+    guard.close("the guard was ended by a signal")
     (line,) = lines
-    assert "the joints could not be told to stop, so they stop when their drives notice the silence" in line
+    assert "the stop commands could not be sent: the joints stop when their drives miss the host" in line
 
 
 def test_a_program_that_takes_no_frames_keeps_none_to_the_wire_waiting(wires, monkeypatch, tmp_path):
@@ -796,5 +796,5 @@ def test_nobody_there_to_read_what_it_says_is_no_error(monkeypatch):
 
     monkeypatch.setattr(bus_guard.sys, "stderr", Gone())
     guard = BusGuard(Policy(CONTENT), Side(), Side())
-    guard.close("the guard was told to end")
+    guard.close("the guard was ended by a signal")
     assert guard.closed

@@ -118,6 +118,6 @@ def test_a_drive_that_keeps_on_is_not_driven():
     sim = simulated(arm)
     with Link(arm, LockStepBus(arm=sim)) as link:
         link.start()
-        with pytest.raises(Refused, match="base: if this host dies, the drive goes on"):
+        with pytest.raises(Refused, match="base: if this host dies, the drive continues"):
             link.enable()
     assert all(node.value(0x6041) & 0x6F != 0x27 for node in sim.nodes)

@@ -99,7 +99,7 @@ def test_without_a_timeout_it_is_scanned_and_checked_and_not_driven(family, tmp_
     simulated = SimulatedArm(arm, Truth.of(arm), 1)
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
-        with pytest.raises(Refused, match="hinge_1: if this host dies, the drive goes on"):
+        with pytest.raises(Refused, match="hinge_1: if this host dies, the drive continues"):
             link.enable()
     assert not any(device.motor.powered for device in (simulated.device(0), simulated.device(1)))
     monkeypatch.chdir(tmp_path)

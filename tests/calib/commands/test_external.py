@@ -155,7 +155,7 @@ def test_what_is_learned_is_kept_in_a_file(workplace, monkeypatch, capsys):
         answers.append(json.loads(capsys.readouterr().out))
     assert answers[0] == answers[1]
     assert run(["external", "arm.xml", "quiet.csv", "--learned", "quiet.csv"]) == 2
-    assert "quiet.csv: cannot be read" in capsys.readouterr().err
+    assert "quiet.csv: is not a file that --learned has written" in capsys.readouterr().err
 
 
 def test_a_model_file_alone_is_not_called_records(workplace, monkeypatch, capsys):

@@ -144,11 +144,11 @@ def test_a_silent_bus_and_a_file_of_lines(learned, monkeypatch, capsys, tmp_path
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("sarcos", "to listen to the arm give --learned FILE or --baseline RECORDING"),
+        ("sarcos", "to listen to the arm, give --learned FILE or --baseline RECORDING"),
         ("sarcos run.csv --ros2 /joint_states", "run.csv: give recordings or a live source"),
         ("sarcos --ros2 /joint_states --bus virtual:x --learned kept.npz", "give only one of these options"),
-        ("sarcos run.csv --foxglove 0", "--foxglove and --seconds belong to listening"),
-        ("sarcos run.csv --seconds 5", "--foxglove and --seconds belong to listening"),
+        ("sarcos run.csv --foxglove 0", "--foxglove and --seconds are for listening"),
+        ("sarcos run.csv --seconds 5", "--foxglove and --seconds are for listening"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(capsys, words, said):

@@ -97,7 +97,7 @@ def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
     assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply"]) == 0
     said = capsys.readouterr().out
     assert "written to 7 drives" in said
-    assert "of a roll-back only one thing is checked" in said
+    assert "a roll-back has one check" in said
     assert RecordStore(path).writes(load_arm("sarcos"))[0].body["gates"].startswith("roll-back: only the distance")
     assert run(["rollback", "sarcos", "--to", second, "--store", path, "--apply", "--bus", "socketcan:no_such_bus"]) > 1
     assert [line.record for line in RecordStore(path).activations(load_arm("sarcos"))] == [first, second, first]

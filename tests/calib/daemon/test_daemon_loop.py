@@ -357,4 +357,4 @@ def test_messages_of_another_program_are_batches_and_their_end_is_said() -> None
     assert isinstance(messages[0], Up)
     assert sum(len(message.t) for message in messages if isinstance(message, Batch)) == 99  # the last is not complete
     (silent,) = (message for message in messages if isinstance(message, Down))
-    assert silent.reason == "ros2:/joint_states: no message comes any more: does the driver run?"
+    assert silent.reason == "ros2:/joint_states: messages have stopped: does the driver run?"

@@ -48,7 +48,7 @@ def guard_rules(
         unit, profile = read_units(each, row), device.examined(each, row.settings)
         if profile.by_velocity:
             raise BadInput(
-                f"{row.name}: its drive takes only velocities (mode 9), from which a guard cannot tell where the joint "
+                f"{row.name}: its drive takes only velocities (mode 9), which do not show a guard where the joint "
                 "will stop: a guard needs drives with cyclic position (8) or torque (10) mode"
             )
         check_fits(row, limit, unit)
