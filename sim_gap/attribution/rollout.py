@@ -1,11 +1,10 @@
-"""Roll-outs of what is written: simulations with the exported model and module from recorded states.
+"""Roll-outs of what is written: simulations with the exported model and its effects from recorded states.
 
 The whole, each effect added alone, and each left out alone. The windows are short, for an arm with open-loop torque
 drifts away in any case. Each model comes from the text that `--out-model` writes.
 """
 
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import with_effects
-from sim_gap.better_model.export import CorrectedText, joint_effects, model_files, module_text
-from sim_gap.better_model.forward_effects import JointEffect
+from sim_gap.better_model.export import CorrectedText, joint_effects, model_files
+from sim_gap.better_model.forward_effects import Effects, JointEffect
 from sim_gap.model.load import SimModel, named_spec, silent
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
@@ -50,29 +49,28 @@ class RollOuts:
         """Deviation per joint with these terms [rad], RMS over the windows of all recordings, (n,)."""
         share, squares = max(1, windows // len(self.recordings)), []
         bodies = any(term.effect == "link.payload" for term in terms)
-        made: dict[tuple[int, float], tuple[Any, ModuleType, Any]] = {}
+        made: dict[tuple[int, float], tuple[Any, Effects]] = {}
         for r, body in zip(self.recordings, self.bodies, strict=True):
             body = body if bodies else (0, 0.0)
             if body not in made:
-                made[body] = self._files(terms, *body)
-            model, module, effects = made[body]
+                made[body] = self._arm(terms, *body)
+            model, effects = made[body]
             torque = getattr(r, self.channel)
             with silent():
-                stray = module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share)
+                stray = forward_effects.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share)
             squares.append(stray**2)
         return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))
 
-    def _files(self, terms: Sequence[Term], number: int, mount: float) -> tuple[Any, ModuleType, Any]:
-        """Model, module and effects with these terms as they are written for one recording."""
+    def _arm(self, terms: Sequence[Term], number: int, mount: float) -> tuple[Any, Effects]:
+        """Model and effects beside it with these terms as they are written for one recording."""
+        laws = self.laws if terms else ()
         if self.sim.path is None:  # a compiled model has no file to write
             corrected = with_effects(self.sim, self.estimate, terms, number, mount)
-            entries = joint_effects(self.sim, self.estimate, corrected.not_held, corrected.held)
-            entries += self.laws if terms else ()
-            own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
-            return corrected.model, forward_effects, own
-        files = model_files(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
-        model, module = _compiled(files), _loaded(self.sim, files)
-        return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
+            model, beside = corrected.model, joint_effects(self.sim, self.estimate, corrected.not_held, corrected.held)
+            return model, Effects(model, [*beside, *laws], self.sim.arm.names)
+        files = model_files(self.sim, self.estimate, NAME, terms, number, laws, self.spec, mount)
+        model = _compiled(files)
+        return model, Effects(model, files.effects, self.sim.arm.names)
 
 
 def roll_out(
@@ -112,12 +110,3 @@ def _compiled(files: CorrectedText) -> Any:
         return mujoco.MjModel.from_xml_string(files.xml)
     except ValueError:
         return files.spec.compile()
-
-
-def _loaded(sim: SimModel, files: CorrectedText) -> ModuleType:
-    """The module from its text; the one that it is made from if there is none."""
-    if not files.effects:
-        return forward_effects
-    module = ModuleType("model_effects")
-    exec(compile(module_text(sim, files.effects, NAME), "model_effects.py", "exec"), module.__dict__)
-    return module

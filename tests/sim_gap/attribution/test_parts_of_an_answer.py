@@ -97,13 +97,13 @@ def test_reversals_are_where_a_joint_hardly_moves() -> None:
 def test_a_file_is_made_for_each_body_and_a_single_one_without(monkeypatch, terms, made) -> None:
     """Recordings 1 and 2 have the body, the second turned; the files without it are the same for both."""
     asked: list[tuple[int, float]] = []
-    rolled = SimpleNamespace(roll_out=lambda model, effects, t, q, torque, source, windows: np.array([3.0, 4.0]))
 
-    def files(self: RollOuts, terms: list[Term], number: int, mount: float) -> tuple:
+    def arm(self: RollOuts, terms: list[Term], number: int, mount: float) -> tuple:
         asked.append((number, mount))
-        return None, rolled, None
+        return None, None
 
-    monkeypatch.setattr(rollout.RollOuts, "_files", files)
+    monkeypatch.setattr(RollOuts, "_arm", arm)
+    monkeypatch.setattr(rollout.forward_effects, "roll_out", lambda *given, windows: np.array([3.0, 4.0]))
     own = object.__new__(RollOuts)
     own.recordings = [SimpleNamespace(t=None, position=None, torque=None)] * 2
     own.bodies, own.channel, own.source = [(1, 0.0), (2, 0.5)], "torque", "sensor"
