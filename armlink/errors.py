@@ -42,7 +42,11 @@ class HostLate(Stall):
 
     def __init__(self, late: float, limit: float, then: str = "") -> None:
         """How late its SYNC was and how late it may be [s], and what a joint did about it."""
-        super().__init__(f"the host was {late * 1e3:.0f} ms late (limit {limit * 1e3:.0f} ms){then and f'; {then}'}")
+        told = f"the host was {late * 1e3:.0f} ms late"
+        if late > limit or not then:
+            super().__init__(f"{told} (limit {limit * 1e3:.0f} ms){then and f'; {then}'}")
+        else:
+            super().__init__(f"{told}, which explains this: {then}")
         self.late, self.limit, self.then = late, limit, then
 
     def __reduce__(self) -> tuple[type["HostLate"], tuple[float, float, str]]:

@@ -110,6 +110,8 @@ def identify(
     out = results(json_file)
     _show(fit, out)
     out.print(f"record {record.id} is current: {fit.identifiable.sum()} of {len(fit.beta)} mass moments are determined")
+    if sweeps[-1].manifest.reference_mass:
+        out.print("take the reference mass off before the next command moves the arm")
     suggest(command_line("verify", arm_file.argument, bus=sweeps[-1].manifest.bus or None, store=store))
     write_json(json_file, _answer(fit, record.id))
     return 0

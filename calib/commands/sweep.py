@@ -83,13 +83,14 @@ def sweep(
     refuse_impossible_sweep(arm_file, reference_mass)
     if plan:
         write_json(json_file, _plan(arm_file, seed, reference_mass, picture, results(json_file)))
-        folder = new_folder(Path("loaded" if reference_mass else "unloaded"))
+        simulated = bus is None and arm_file.require_link().bus.interface == SIMULATED
+        folder = Path(("rehearsal-" if simulated else "") + ("loaded" if reference_mass else "unloaded"))
         suggest(
             command_line(
                 "sweep",
                 arm,
-                *["--dry-run"] * (bus is None and arm_file.require_link().bus.interface == SIMULATED),
-                out=folder,
+                *["--dry-run"] * simulated,
+                out=new_folder(folder),
                 reference_mass=f"{reference_mass:g}" if reference_mass else None,
                 bus=bus,
                 hold=hold,

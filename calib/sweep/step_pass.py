@@ -119,7 +119,7 @@ class StepPass(SweepPass):
             try:
                 return run_scout(self.mover, plan, done, self._save)
             except Stall as stall:
-                self.bridge(stall, f"{SCOUT} {len(done) + 1}")
+                self.bridge(stall, f"{SCOUT} {sum(reading.sweep == SCOUT for reading in self.readings) + 1}")
 
     def sweep(self, sweep: Sweep) -> None:
         """Take the readings of one sweep that are still to be taken; a joint that slips is pressed again."""
