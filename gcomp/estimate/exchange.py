@@ -80,11 +80,10 @@ class EffectChoice(Generic[Name]):
         there = {*names}
         return [name for name in self.effects if name not in there]
 
-    def step(self, trials: Iterable[Sequence[Name]], rise: float) -> bool:
-        """Go on with the best of some sets whose score rises by less than this, unless it rises more once the channels
-        are weighed by what it leaves; whether there was one."""
+    def step(self, trials: Iterable[Sequence[Name]], bound: float, rise: float = 0.0) -> bool:
+        """Go on with the best of some sets whose score is below a bound, unless the score is no better, or rises by
+        `rise` and more, once the channels are weighed by what it leaves; whether there was one."""
         best: Sequence[Name] | None = None
-        bound = self.score + rise
         for trial in trials:
             if frozenset(trial) not in self.worse and len(trial) <= MOST_EFFECTS:
                 score = self.judge(trial)
@@ -94,7 +93,7 @@ class EffectChoice(Generic[Name]):
             return False
         before = self.current, self.terms, self.score
         self._take(list(best))
-        if self.score >= before[2] + max(rise, 0.0):
+        if self.score >= before[2] + rise:
             self.worse.add(frozenset(best))
             self.current, self.terms, self.score = before
         return True
@@ -103,15 +102,15 @@ class EffectChoice(Generic[Name]):
         """Add the effect that helps most, if any pays."""
         offered = self._rest(self.current)
         names = self.shortlist(self.current, offered, SHORTLIST) if offered else []
-        return self.step((self.with_needs(name, self.current) for name in names), -self.least)
+        return self.step((self.with_needs(name, self.current) for name in names), self.score - self.least)
 
     def backward(self) -> bool:
         """Take the effect out that is missed least, if the rest scores as well without it."""
-        return self.step((self.without(name, self.current) for name in self.current), AS_GOOD)
+        return self.step((self.without(name, self.current) for name in self.current), self.score + AS_GOOD, AS_GOOD)
 
     def exchange(self) -> bool:
         """Put one effect in the place of another, or simpler ones together in that of one, if that scores better."""
-        return self.step(self._exchanged(), -self.least)
+        return self.step(self._exchanged(), self.score - self.least)
 
     def _exchanged(self) -> Iterator[list[Name]]:
         for name in list(self.current):
@@ -126,7 +125,7 @@ class EffectChoice(Generic[Name]):
     def pair(self) -> bool:
         """Add two effects of which neither pays without the other, such as friction that grows with a load beside a
         mass that the model lacks."""
-        return self.step(self._pairs(), -2.0 * self.least)
+        return self.step(self._pairs(), self.score - 2.0 * self.least)
 
     def _pairs(self) -> Iterator[list[Name]]:
         offered = self._rest(self.current)
