@@ -83,6 +83,14 @@ def test_two_effects_of_which_neither_pays_alone_enter_together() -> None:
     assert sorted(choice.run()) == ["e0", "e1"]
 
 
+def test_an_effect_that_costs_nothing_and_is_not_missed_leaves() -> None:
+    random = np.random.default_rng(5)
+    x = random.normal(size=(ROWS, 2)) * np.array([1.0, 0.0])
+    y = x[:, 0] + 0.2 * random.normal(size=ROWS)
+    effects = singles(2) | {"e1": Effect("e1", (1,), price=0.0)}
+    assert EffectChoice(terms(x, y, 0.0), effects, ["e0", "e1"]).run() == ["e0"]
+
+
 def test_an_effect_brings_what_it_needs_and_puts_out_what_it_excludes() -> None:
     own = terms(np.eye(ROWS)[:, :3], np.zeros(ROWS))
     effects = {
