@@ -182,9 +182,9 @@ class SensorFit(FittedCalibration):
         if np.isnan(point).all():
             return "where the reference mass hung is not observable"
         place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
-        moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
+        moments = [f"{_triple(mass * point)} kg·m with {mass:g} kg" for mass in self.rows.masses if mass]
         return (
-            f"the reference mass hung at ({place}) m in the frame of the last joint; its mass moment is "
+            f"the reference mass hung at ({place}) m in the frame of the last joint; its mass moment was "
             f"{'; '.join(moments)}"
         )
 

@@ -90,20 +90,22 @@ class ControlPipe:
         self._rest = b""
 
     def poll(self, injector: Injector) -> list[str]:
-        """Execute the lines received; returns error messages."""
+        """Execute the lines received; returns each with `: done`, or what is wrong with it."""
         try:
             self._rest += os.read(self._file, 65536)
         except BlockingIOError:
             return []
         *lines, self._rest = self._rest.split(b"\n")
-        wrong = []
+        answers = []
         for line in lines:
             if line.strip():
+                text = line.decode(errors="replace")
                 try:
-                    obey(line.decode(errors="replace"), injector)
+                    obey(text, injector)
+                    answers.append(f"{text.strip()}: done")
                 except ArmlinkError as error:
-                    wrong.append(str(error))
-        return wrong
+                    answers.append(str(error))
+        return answers
 
     def close(self) -> None:
         os.close(self._file)

@@ -60,8 +60,8 @@ class ArmServer:
             self._line = self._injector
             for fault in faults:
                 self._injector.inject(fault)
-        self.on_wrong: Callable[[str], None] = lambda wrong: None
-        """Called with the error message of a command."""
+        self.on_command: Callable[[str], None] = lambda answer: None
+        """Called with the answer to each command of the control pipe."""
         self.on_late: Callable[[float, float], None] = lambda lag, at: None
         """Called with how late [s] this process was, and when by the arm's time [s]; once a second at most."""
         self._late_said = -math.inf
@@ -100,8 +100,8 @@ class ArmServer:
         if self._lockstep or self._until_tick() <= 0.0:
             self._let_time_pass()
         if self._control is not None and self._injector is not None:
-            for wrong in self._control.poll(self._injector):
-                self.on_wrong(wrong)
+            for answer in self._control.poll(self._injector):
+                self.on_command(answer)
         self._flush()
 
     def _until_tick(self) -> float:

@@ -95,7 +95,7 @@ def sim(
             f"stop with Ctrl-C"
         )
         server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
-        server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
+        server.on_command = lambda answer: console.print(f"sim: {answer}")
         server.on_late = lambda lag, at: console.print(
             f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s, so a host may report silent drives"
         )

@@ -131,11 +131,11 @@ def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.Bu
 
 
 def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, can.BusABC], tmp_path: Path) -> None:
-    described, hand, wrong = one_joint(), Hand(), []
+    described, hand, answers = one_joint(), Hand(), []
     arm = SimulatedArm(described, Truth.of(described))
     pipe = ControlPipe(tmp_path / "arm.pipe")
     server = ArmServer(arm, as_bus(ends[0]), now=hand.now, control=pipe)
-    server.on_wrong = wrong.append
+    server.on_command = answers.append
 
     def order(*lines: str) -> None:
         pipe.path.write_text("".join(f"{line}\n" for line in lines))
@@ -150,9 +150,12 @@ def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, ca
     assert arm.nodes[0].unplugged
     order("faults none")
     assert not arm.nodes[0].unplugged
+    assert answers[2] == "mass 0.5: done"
+    answers.clear()
     order("dance", "effect nothing:hinge:1", "mass heavy", "fault node.silent")
-    assert len(wrong) == 4
-    assert "effect ID:JOINT:VALUE" in wrong[0]
+    assert len(answers) == 4
+    assert not any(answer.endswith(": done") for answer in answers)
+    assert "effect ID:JOINT:VALUE" in answers[0]
     pipe.close()
     assert not pipe.path.exists()
 
