@@ -7,11 +7,11 @@ that filter.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt, sosfreqz
+from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
@@ -392,19 +392,10 @@ def decimation(rate: float, stride: int) -> Callable[[Array], Array]:
 def low_pass(cut: float, rate: float, pad: int = 15) -> Callable[[Array], Array]:
     """Zero-phase low pass (4th-order Butterworth) at `cut` of signals at `rate` [Hz], along the first axis.
 
-    As `scipy.signal.sosfiltfilt`, which finds the filter's state at rest again at each call; `pad` is the length of the
-    reflection at either end, in samples.
+    `pad` is the length of the reflection at either end, in samples.
     """
-    sections = butter(4, cut, fs=rate, output="sos")
-    at_rest = sosfilt_zi(sections)[:, None]
+    return partial(_both_ways, butter(4, cut, fs=rate, output="sos"), pad)
 
-    def both_ways(x: Array) -> Array:
-        edge, columns = min(pad, len(x) - 1), x.reshape(len(x), -1).T
-        before = 2.0 * columns[:, :1] - columns[:, edge:0:-1]
-        after = 2.0 * columns[:, -1:] - columns[:, -2 : -edge - 2 : -1]
-        longer = np.hstack([before, columns, after])
-        for _ in range(2):
-            longer = sosfilt(sections, longer, zi=at_rest * longer[:, :1])[0][:, ::-1]
-        return np.asarray(longer[:, edge : edge + len(x)].T.reshape(x.shape))
 
-    return both_ways
+def _both_ways(sections: Array, pad: int, x: Array) -> Array:
+    return np.asarray(sosfiltfilt(sections, x, axis=0, padlen=min(pad, len(x) - 1)))
