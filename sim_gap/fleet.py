@@ -22,8 +22,6 @@ from sim_gap.model.load import parse_known_gains
 
 CONNECT_SECONDS = 10.0
 """Longest wait for a scheduler to answer [s]."""
-WORKER_DEATHS = 3
-"""A case at which this number of workers died is given up."""
 
 
 def open_to_all(scheduler: str | None) -> str:
@@ -44,12 +42,10 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
     run and that nobody else has; at an address tls:// the keys are those of dask's configuration.
     Raises BusFault (exit status 3) if no scheduler answers at the address.
     """
-    import dask
     from distributed import Client, LocalCluster
     from distributed.security import Security
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
-    dask.config.set({"distributed.scheduler.allowed-failures": WORKER_DEATHS})
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_SECONDS)

@@ -131,7 +131,7 @@ class Checks:
 
 
 class Counted(Protocol):
-    """What takes in the readings of a link: it counts those of each joint."""
+    """A loop that takes in the readings of a link, counted by joint."""
 
     board: Board
 
