@@ -65,8 +65,10 @@ def load_learned(path: Path, records: ArmRecords) -> Learned:
         )
         listener = ArmListener(model, records, str(content["channel"]), float(content["rate"]), content.get("warm"))
         return Learned(listener, WrenchFrame(int(content["link"]), content["point"]), float(content["per_hour"]))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise BadInput(f"{path}: is not a file that --learned has written: {error}") from None
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        raise BadInput(f"{path}: is not a file that --learned has written: learn again with --baseline") from None
 
 
 def _ids(records: ArmRecords) -> tuple[str, str]:

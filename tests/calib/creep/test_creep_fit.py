@@ -185,7 +185,7 @@ def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given(tmp
     assert "cable" in fit.reasons["openarm_right_joint4", "gain"]
     store, how = RecordStore(str(tmp_path / "records.db")), Apply(by="ann", check=False)
     record = fit.record(arm())
-    with pytest.raises(GateRefused, match=r"cable under tension.*--accept openarm_right_joint4"):
+    with pytest.raises(GateRefused, match=r"free the cable or spring.*--accept openarm_right_joint4"):
         apply_creep(record, arm(), store, how, fit.broken, None)
     assert store.current(CalibrationRecord, arm()) is None
     apply_creep(record, arm(), store, replace(how, accepted=("openarm_right_joint4",)), fit.broken, None)

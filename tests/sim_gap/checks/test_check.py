@@ -336,7 +336,7 @@ def test_torques_exchanged_midway_are_doubted(arm, motor):
     exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
     doubt(
         check(arm, replace(motor, motor_torque=exchanged, velocity=None)),
-        r"after 50% of the recording, .* --map tau_motor_2=tau_motor_3",
+        r"after 50% of the recording.* --map tau_motor_2=tau_motor_3",
     )
 
 
@@ -345,7 +345,7 @@ def test_torques_exchanged_in_a_part_of_the_rows_are_doubted_with_their_place(ar
     rows = (motor.t > motor.t[0] + share * np.ptp(motor.t)) == late
     exchanged = motor.motor_torque.copy()
     exchanged[rows] = exchanged[rows][:, [2, 1, 0]]
-    place = rf"{'after' if late else 'before'} {share:.0%} of the recording, .* --map tau_motor_1=tau_motor_3"
+    place = rf"{'after' if late else 'before'} {share:.0%} of the recording.* --map tau_motor_1=tau_motor_3"
     doubt(check(arm, replace(motor, motor_torque=exchanged, velocity=None)), place)
 
 

@@ -123,5 +123,5 @@ def test_what_was_learned_with_other_records_is_not_used(taught, tmp_path):
     with pytest.raises(Exception, match="other records"):
         load_learned(taught.service.external.path, records_of(other))
     Path(tmp_path / "bad.npz").write_bytes(b"none")
-    with pytest.raises(Exception, match="cannot be read"):
+    with pytest.raises(Exception, match="is not a file that --learned has written"):
         load_learned(tmp_path / "bad.npz", records_of(other))
