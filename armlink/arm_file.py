@@ -23,6 +23,8 @@ SIMULATED = "armlink_sim"
 """Interface of a simulated arm in this process; its channel is an arm file."""
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+LONGEST_DEADLINE = 10.0
+"""Of a link [s]."""
 
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
@@ -203,7 +205,7 @@ class LinkSection(Section):
     """Further buses by name, for joints that name one; ids are unique on each bus."""
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
-    deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
+    deadline: Annotated[FiniteFloat, Field(ge=0.01, le=LONGEST_DEADLINE)] = 0.1
     """A joint that hears no command for this long goes to quick stop; a reading this old is a fault [s]."""
     joints: tuple[LinkJoint, ...]
     park: Park | None = None

@@ -130,25 +130,19 @@ class Checks:
         return ((name, check) for check in checks for name in names if (name, check) not in reached)
 
 
-class Counted(Protocol):
-    """A loop that takes in the readings of a link, counted by joint."""
+def count_answers(
+    board: Board, cycle: Callable[[], Array], cycles: int, listen: Callable[[], object]
+) -> list[tuple[bool, str]]:
+    """Whether each joint answers so many cycles, in time or late, and how many it did, in words.
 
-    board: Board
-
-    def listen(self, seconds: float) -> object: ...
-
-
-def count_answers(loop: Counted, cycle: Callable[[], Array], cycles: int, period: float) -> list[tuple[bool, str]]:
-    """Whether each joint answers so many cycles of `period` [s], in time or late, and how many it did, in words.
-
-    `cycle` makes one and returns the positions (n,) that came in it, NaN where none did.
+    `cycle` makes one and returns the positions (n,) that came in it, NaN where none did; `listen` waits for late ones.
     """
-    before = loop.board.came.copy()
+    before = board.came.copy()
     in_time = np.sum([np.isfinite(cycle()) for _ in range(cycles)], axis=0)
     if (in_time < cycles).any():
-        loop.listen(cycles * period)
+        listen()
     found = []
-    for now, then, timely in zip(loop.board.came, before, in_time.tolist(), strict=True):
+    for now, then, timely in zip(board.came, before, in_time.tolist(), strict=True):
         came = min(now - then, cycles)
         late = f", {came - timely} of them late: this host, the bus or the drive is busy" if came > timely else ""
         found.append((came >= ANSWERED * cycles, f"{came} of {cycles} cycles answered{late}"))

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.arm_file import LONGEST_DEADLINE
 from armlink.arrays import Array
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import BUS_SHIFT, Frame, Port
@@ -33,9 +34,7 @@ LEAST_REST = 1e-4
 RECEPTION_TRIES = 16
 """A frame is asked for so often of a port that reports faults; a batch that tells of one may hold frames too."""
 LATE_CYCLES = 3
-"""A joint that has answered in so many cycles, and never caught up, is not late: a reply was lost."""
-ASKS_KEPT = 27
-"""Replies are attributed to so many commands back: a joint that is silent for longer has the link stopped."""
+"""A joint that has answered in so many cycles, and is as far behind as before, is not late: a reply was lost."""
 _UNTAGGED = (1 << BUS_SHIFT) - 1
 
 
@@ -109,12 +108,13 @@ class Loop:
         """When the velocity of each joint last came, by the clock [s]."""
         self.synced = -math.inf
         """When the last commands left, by the clock [s]."""
-        self._behind = [0] * self.n
-        """Cycles in which each joint has answered since it last caught up with its commands."""
+        self._left, self._behind = [0] * self.n, [0] * self.n
+        """Unanswered commands of each joint in the cycle before; cycles in which it has answered since it last came
+        nearer to having answered all."""
         self.earliest, self.latest = [-math.inf] * self.n, [-math.inf] * self.n
         """Bounds of the time at which the newest position of each joint was taken, by the clock [s]."""
-        self._asked_at: deque[float] = deque(maxlen=ASKS_KEPT)
-        """When the newest commands left, by the clock [s]."""
+        self._asked_at: deque[float] = deque(maxlen=math.ceil(LONGEST_DEADLINE / period))
+        """When the newest commands left, by the clock [s]; a joint that is silent for longer has the link stopped."""
         self._collected = self._heard_until = -math.inf
         """When the replies of this cycle and of the one before were in, by the clock [s]."""
 
@@ -209,7 +209,7 @@ class Loop:
         self.just_woke = False
         self.drain()
         self.synced = -math.inf
-        self.board.unanswered, self._behind = [0] * self.n, [0] * self.n
+        self.board.unanswered, self._left, self._behind = ([0] * self.n for _ in range(3))
         self._dropped = self._port.dropped
         self.watch.settle()
 
@@ -326,19 +326,20 @@ class Loop:
         return found
 
     def _timely(self) -> NDArray[np.bool_] | None:
-        """Which readings are replies to this cycle's commands; None: all. Of a joint that does not catch up for long, a
-        reply was lost."""
+        """Which readings are replies to this cycle's commands; None: all. Of a joint that answers for long and does not
+        catch up, a reply was lost."""
         board = self.board
-        unanswered, behind = board.unanswered, self._behind
+        unanswered, before, behind = board.unanswered, self._left, self._behind
+        self._left = unanswered.copy()
         if not any(unanswered):
-            self._behind = [0] * self.n
             return None
         came = [raw == raw for raw in board.position]
         timely = np.array([here and not left for here, left in zip(came, unanswered, strict=True)])
         for joint, here in enumerate(came):
-            behind[joint] = behind[joint] + here if unanswered[joint] else 0
+            left = unanswered[joint]
+            behind[joint] = behind[joint] + here if left >= before[joint] > 0 else 0
             if behind[joint] >= LATE_CYCLES:
-                unanswered[joint] = behind[joint] = 0
+                unanswered[joint] = self._left[joint] = behind[joint] = 0
         return timely
 
     def listen(self, seconds: float) -> Sample:

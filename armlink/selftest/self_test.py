@@ -150,8 +150,9 @@ class SelfTest:
                 self.checks.add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
         self._places()
         self._calibrations()
-        off, commander = [Power.OFF] * link.n, link.commander
-        answers = count_answers(commander.loop, lambda: commander.stand(off).position, ANSWER_CYCLES, link.period)
+        off, commander, loop = [Power.OFF] * link.n, link.commander, link.commander.loop
+        cycle, late = lambda: commander.stand(off).position, lambda: loop.listen(ANSWER_CYCLES * link.period)
+        answers = count_answers(loop.board, cycle, ANSWER_CYCLES, late)
         for name, (good, found) in zip(link.names, answers, strict=True):
             self.checks.judge(name, "answers", good, found)
         return all(good for good, _ in answers)

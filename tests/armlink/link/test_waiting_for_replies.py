@@ -189,9 +189,11 @@ class Behind(EchoPort):
     A joint's position tells to which command it is the reply.
     """
 
-    def __init__(self, clock: WaitedFor, seed: int, stalls: float) -> None:
+    def __init__(self, clock: WaitedFor, seed: int, stalls: float, longest: float = 0.02) -> None:
+        """Share of commands at which they stall, and for how long at most [s]."""
         super().__init__(load_arm("sarcos"))
-        self.clock, self.random, self.stalls = clock, np.random.default_rng(seed), stalls
+        self.clock, self.random = clock, np.random.default_rng(seed)
+        self.stalls, self.longest = stalls, longest
         self.free = 0.0
         self.taken: list[float] = []
         """When the reply to each command was made, by the number of the command."""
@@ -201,8 +203,8 @@ class Behind(EchoPort):
     def send(self, can_id: int, data: bytes) -> None:
         if can_id == 1:  # to the first joint: another command
             stalls = self.random.random() < self.stalls
-            self.free = max(self.free, self.clock.time + self.random.uniform(1e-4, 0.02 if stalls else 1e-3))
-            self.taken.append(self.free)
+            self.free = max(self.free, self.clock.time + self.random.uniform(1e-4, self.longest if stalls else 1e-3))
+            self.taken.append(self.clock.time)  # and they leave late: the oldest that they may be
             self.coming.append((self.free + self.random.uniform(0.0, 3e-3), (0x7F0, b"")))
         number = len(self.taken) - 1
         if number not in self.lost:
@@ -220,9 +222,12 @@ class Behind(EchoPort):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_reading_was_taken_between_its_own_command_and_its_coming_however_late_it_is(seed: int) -> None:
+@pytest.mark.parametrize(("stalls", "longest"), [(0.03, 0.02), (0.01, 0.5)])
+def test_a_reading_was_taken_between_its_own_command_and_its_coming_however_late_it_is(
+    seed: int, stalls: float, longest: float
+) -> None:
     clock = WaitedFor(1e-5)
-    port = Behind(clock, seed, stalls=0.03)
+    port = Behind(clock, seed, stalls, longest)
     loop = echo_commander(load_arm("sarcos"), port, clock).loop
     for _ in range(400):
         clock.time += port.random.uniform(0.0, 4e-3)

@@ -125,7 +125,8 @@ class PowerTest:
         self.drives.known.node_states.clear()
         beat = 2 * self.drives.protection.producer_ms * 1e-3
         cycles = max(ANSWER_CYCLES, int(np.ceil(beat / link.period)) + 1)
-        answers = count_answers(self.loop, lambda: self._cycle(off).position, cycles, link.period)
+        cycle, late = lambda: self._cycle(off).position, lambda: self.loop.listen(cycles * link.period)
+        answers = count_answers(self.loop.board, cycle, cycles, late)
         for joint, (answered, told) in enumerate(answers):
             self._tell(joint, "answers SYNC", answered, told)
             heard = joint in self.drives.known.node_states
