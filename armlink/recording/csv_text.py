@@ -6,11 +6,13 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from armlink.arrays import Array
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 
 SEPARATORS = ",;\t "
@@ -198,6 +200,31 @@ def no_time(cell: object, row: int, source: str) -> BadInput:
     return BadInput(
         f"{source}: row {row + 1}: t is {cell!r}, expected a number [s] or a date such as 2026-11-24 12:00:00.25"
     )
+
+
+def load_poses(path: Path, n: int) -> Array:
+    """Poses (K, n) [rad] from the columns q_1 … q_n of a CSV file with a header row; other columns are left alone.
+
+    Raises BadInput naming the file and the column, or the row.
+    """
+    if not path.is_file():
+        raise BadInput(f"there is no file {path}: give a CSV file with the columns q_1 … q_{n} [rad]")
+    wanted = [f"q_{number}" for number in range(1, n + 1)]
+    with memory_budget(path):
+        content = path.read_bytes()
+        layout = layout_of(content, str(path))
+        missing = next((name for name in wanted if name not in layout.header), None)
+        if missing is not None:
+            raise BadInput(
+                f"{path}: column {missing} is missing: expected one column for each joint, q_1 … q_{n} [rad]"
+            )
+        columns = {name: layout.header.index(name) for name in wanted}
+        poses = np.column_stack(list(read_numbers(content, layout, columns, str(path)).values()))
+    if not len(poses):
+        raise BadInput(f"{path}: there is no pose below the header row")
+    for row, joint in np.argwhere(~np.isfinite(poses)):
+        raise BadInput(f"{path}: row {row + 1}: {wanted[joint]} is {poses[row, joint]}, expected an angle in rad")
+    return poses
 
 
 def write_numbers(stream: IO[bytes] | io.BufferedIOBase, columns: Mapping[str, Array]) -> None:

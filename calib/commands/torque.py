@@ -34,7 +34,7 @@ def torque(
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
-    from calib.commands.poses_csv import load_poses
+    from armlink.recording.csv_text import load_poses
     from gcomp.gravity.torque import gravity_torque
 
     described, beta, source = _model(arm, base, tip, record, tool, store)

@@ -38,12 +38,12 @@ from armlink.errors import ArmlinkError, BadInput
 from armlink.guard.bus_guard import Policy, PolicyError
 from armlink.link.joints.groups import make_groups
 from armlink.model_file import compile_model
+from armlink.recording.csv_text import load_poses
 from armlink.recording.files import load_recordings, save_recording
 from armlink.recording.recording import Recording
 from armlink.recording.replay import recording_of_log
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.commands.poses_csv import load_poses
 from calib.daemon.settings import daemon_section
 from calib.dataset import load_data
 from calib.observer.decision import DriftFinding
