@@ -158,8 +158,9 @@ def test_the_told_discrepancy_grows_with_the_arms_and_is_what_new_poses_show() -
 
 @pytest.mark.long
 def test_more_readings_of_the_same_poses_do_not_make_it_certain() -> None:
+    """Four times the readings halve what differs from pass to pass, noise and drift; effects of the pose stay."""
     arm, _ = drawn_arm(SEED)
     fit, _, data, _ = real(3.0)
-    again = [*data, *(replace(each, path=Path(f"{each.path}-again")) for each in data)]
-    twice = fit_sensors(arm, again)
-    assert (twice.std("gain") > 0.85 * fit.std("gain")).all()
+    again = [replace(each, path=Path(f"{each.path}-{copy}")) for copy in range(4) for each in data]
+    repeated = fit_sensors(arm, again)
+    assert (repeated.std("gain") > 0.6 * fit.std("gain")).all()
