@@ -106,7 +106,7 @@ def check(
             f"{first.found}"
         )
     passed = sum(each.outcome == "passed" for each in found)
-    left = "the joints were not enabled" if passive else joints_left(described)
+    left = "checks that enable the joints were not made" if passive else joints_left(described)
     out.print(f"all {passed} checks passed (a row of the table may stand for several checks of each joint); {left}")
     step = ["check", arm] if passive else ["sweep", arm, "--plan"] if described.has_geometry else ["doctor", arm]
     suggest(command_line(*step, bus=bus))

@@ -204,7 +204,8 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
     if isinstance(fit, SensorFit):
         columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
         doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-        lines.append(f"at new poses, sensors and gravity model still differ by [N·m]: {', '.join(doubts)}")
+        told = "expected difference of sensors and gravity model at new poses, without noise"
+        lines.append(f"{told} [N·m]: {', '.join(doubts)}")
         lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
         if fit.gain_ratio is not None:
             ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))

@@ -109,8 +109,8 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
     """Print the findings of the pre-flight, one row per joint."""
-    headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
-    table = Table(*headings, title="Pre-flight")
+    measured = ("torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop [rad]", "upper stop [rad]")
+    table = Table("joint", *measured, title="Pre-flight")
     for joint, name in enumerate(found.names):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
