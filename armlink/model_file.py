@@ -235,6 +235,18 @@ def compile_spec(spec: Any, path: Path, hint: str = "") -> Any:
     return model
 
 
+def add_actuator(spec: Any, name: str, target: str, kind: Any = None) -> Any:
+    """Add a motor of gear 1 on a joint, or on another kind of target, to an `MjSpec`: without its file's defaults."""
+    import mujoco
+
+    made = spec.add_actuator(name=name, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT if kind is None else kind)
+    made.set_to_motor()
+    made.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    made.ctrllimited = made.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    made.armature, made.damping = 0.0, 0.0 * made.damping
+    return made
+
+
 def _refuse_what_is_no_number(model: Any, path: Path) -> None:
     """MuJoCo takes NaN and infinity from a file, and all that follows from them is NaN."""
     import numpy as np

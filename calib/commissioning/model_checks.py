@@ -19,14 +19,18 @@ from calib.plan.rough_gravity import HAND, guess_of_file, reach
 from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
-from gcomp.gravity.torque import gravity_levers, gravity_torque
+from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_torque
 
 NO_MASS = 1e-9
 """Mass of all moving links that stands for none [kg]: the reader gives massless bodies a negligible one."""
-LIGHTEST, HEAVIEST = 0.3, 1000.0
+LIGHTEST, HEAVIEST = 0.1, 1000.0
 """Mass of the moving links over the cube of the reach [kg/m³] that an arm may have. Published arms, legs and hands have
-1.2 to 81 (57 models of example-robot-data and rtb-data); with grams taken for kilograms they have 1200 or more."""
+1.2 to 81 (57 models of example-robot-data and rtb-data), a two-link arm of 1 kg/m has 0.25; with grams taken for
+kilograms or the reverse they have 1200 or more, or 0.081 or less."""
+SAME_POINT = 1e-4
+"""Lever [m] of a mass below which axes are said to meet in one point; models have rounded lengths."""
 POSES = 500
 """Random poses at which the torque against gravity is looked at."""
 
@@ -40,6 +44,8 @@ def refuse_impossible_model(arm_file: ArmFile) -> None:
 def refuse_impossible_sweep(arm_file: ArmFile, reference_mass: float) -> None:
     """Raise BadInput as `refuse_impossible_model`, and where the drives cannot hold a reference mass [kg] in sweeps."""
     refuse_impossible_model(arm_file)
+    for found in gain_errors(arm_file):
+        raise BadInput(str(found))
     if not reference_mass:
         return
     if sweep_motion(arm_file) == "creep":
@@ -69,6 +75,28 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
         )
         return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
     return []
+
+
+def gain_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """The error that a reference mass tells no torque gain: a mass at one point of the last link loads no joint.
+
+    All that it shows are then products of a gain and its unknown distance from this point.
+    """
+    if not arm_file.has_geometry:
+        return
+    arm = gcomp_arm(arm_file)
+    (origin, by_point), regressor = payload_columns(arm), gravity_regressor(arm, _poses(arm)).reshape(-1, 2 * arm.n)
+    torque, shift = regressor @ origin, regressor @ by_point
+    left = torque - shift @ np.linalg.lstsq(shift, torque, rcond=None)[0]
+    if np.abs(left).max() < SAME_POINT * np.linalg.norm(arm.gravity):
+        yield SetupFinding(
+            "error",
+            "the axes of all joints that gravity loads pass through one point, so a mass whose place is unknown cannot "
+            "tell the torque gains",
+            str(arm_file.path),
+            "add a joint whose axis passes elsewhere (--base, --tip), or trust the drives' torques and learn gravity "
+            "from poses at rest: armlink identify POSES --model MODEL",
+        )
 
 
 def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:

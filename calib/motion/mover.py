@@ -203,8 +203,7 @@ class Mover:
     def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:
         """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Slipped."""
         joints = stops != 0
-        self._creep(stops, joints)
-        self._contact = self.position.copy()
+        self._contact = self._creep(stops, joints, bias * stops)
         self.side = np.where(joints, stops, 0).astype(float)
         self.pressed = joints.copy()
         self._guard_stops(BOUNCE)
@@ -229,7 +228,7 @@ class Mover:
 
         Raises Refused where a stop is not at the arm file's place.
         """
-        self._creep(stops, stops != 0)
+        self._creep(stops, stops != 0, self.limits.max_torque)
         for joint in np.flatnonzero(stops):
             self._check_stop(int(joint), int(stops[joint]))
         return self.position.copy()
@@ -301,8 +300,13 @@ class Mover:
             if np.all((high - low < still) | ~joints):
                 return
 
-    def _creep(self, stops: npt.NDArray[np.int64], joints: Mask) -> None:
-        """Move each joint towards its stop until it does not follow any more."""
+    def _creep(self, stops: npt.NDArray[np.int64], joints: Mask, bias: Array) -> Array:
+        """Move each joint towards its stop until it does not follow any more.
+
+        Returns where joints (n,) [rad] stood when their drives last pushed with less than `bias` (n,) [N·m]: a stiff
+        position loop pushes with more before it stops following, and the stop yields.
+        """
+        contact = self.position.copy()
         stride = np.minimum(self.section.approach_speed, self.limits.speed) * self.link.period * stops
         window = max(int(0.1 / self.link.period), 4)
         read, asked, open_joints = [self.position.copy()], [self.command.position.copy()], joints.copy()
@@ -315,6 +319,7 @@ class Mover:
                     np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
                     read.append(self.position.copy())
                     asked.append(row)
+                    np.copyto(contact, self.position, where=open_joints & (self._produced * stops < bias))
                     if len(read) <= window:
                         continue
                     moved, wanted = (self.position - read[-window]) * stops, np.abs(row - asked[-window - 1])
@@ -325,6 +330,7 @@ class Mover:
                     if touched.any():
                         open_joints = open_joints & ~touched
                         break
+        return contact
 
     def _check_creep(self, joint: int, side: int, target: float) -> None:
         """Raise Refused if a joint's target [rad] has gone beyond the place at which its stop should have been."""

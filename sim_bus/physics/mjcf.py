@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.model_file import read_model
+from armlink.model_file import add_actuator, read_model
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.transmission import rotor_name, tendon_name
 from sim_bus.sim_section import LinkBody, SimSection, sim_section
@@ -52,8 +52,7 @@ def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
         _set_friction(joint, section)
     for place, joint in enumerate(joints):
         target, kind = _add_gear(spec, place, [each.name for each in joints], state, section)
-        motor = spec.add_actuator(name=f"motor {joint.name}", target=target)
-        motor.trntype = kind
+        motor = add_actuator(spec, f"motor {joint.name}", target, kind)
         motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtBias.mjBIAS_AFFINE
         motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         motor.forcerange = [-1e9, 1e9]
@@ -137,7 +136,9 @@ def _add_gear(spec: Any, place: int, names: list[str], state: Imperfections, sec
     if state.soft[place]:
         rotor = rotor_name(name)
         body = spec.worldbody.add_body(name=rotor, mass=TINY_INERTIA, inertia=[TINY_INERTIA] * 3, explicitinertial=True)
-        _set_friction(body.add_joint(name=rotor, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1]), section)
+        joint = body.add_joint(name=rotor, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+        _without_defaults(joint)
+        _set_friction(joint, section)
         if not others:
             return rotor, of_joint
         _add_sum(spec, f"encoder {name}", [(rotor, 1.0), *((other, -turn) for other, turn in others)])
@@ -150,9 +151,16 @@ def _add_gear(spec: Any, place: int, names: list[str], state: Imperfections, sec
 def _add_sum(spec: Any, name: str, parts: list[tuple[str, float]]) -> Any:
     """A weighted sum of joint angles."""
     tendon = spec.add_tendon(name=name)
+    _without_defaults(tendon)
     for joint, weight in parts:
         tendon.wrap_joint(joint, weight)
     return tendon
+
+
+def _without_defaults(what: Any) -> None:
+    """Take from a joint or a tendon what the defaults of the model's file gave it."""
+    what.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    what.stiffness, what.damping, what.armature = 0.0 * what.stiffness, 0.0 * what.damping, 0.0
 
 
 def _set_inertial(body: Any, link: LinkBody) -> None:

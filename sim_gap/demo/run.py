@@ -27,7 +27,7 @@ from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
 from calib.commissioning.draft import assumed_lines
-from calib.commissioning.model_checks import refuse_impossible_model
+from calib.commissioning.model_checks import refuse_impossible_sweep
 from calib.commissioning.new_arm import new_arm
 from calib.daemon.state.events import describe
 from calib.dataset import SweepData
@@ -86,7 +86,7 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     arm = load_arm(arm_name)
     if realism is not None:
         arm = with_realism(arm, realism, seed)
-    refuse_impossible_model(arm)
+    refuse_impossible_sweep(arm, 0.0)
     bench, data = Bench(quick(arm), seed), _fresh(out)
     account.say(f"arm {arm.name} with the hidden true values of seed {seed}; the results are in {out}")
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)

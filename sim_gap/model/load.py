@@ -10,7 +10,7 @@ import numpy as np
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
-from armlink.model_file import compile_spec, is_urdf, read_model
+from armlink.model_file import add_actuator, compile_spec, is_urdf, read_model
 from gcomp.arm.inertials import fixed_body_parameters
 from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
 from gcomp.arm.rigid_body import RigidArm, Tendons
@@ -68,7 +68,7 @@ def put_gains(spec: Any, joints: Sequence[int], gains: KnownGains) -> None:
         called = old[0].name if old else f"position_{name}"
         for actuator in old:
             spec.delete(actuator)
-        made = spec.add_actuator(name=called, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made = add_actuator(spec, called, name)
         made.set_to_position(kp=float(gains.kp[j]), kv=float(gains.kd[j]))
         if limits:
             made.forcelimited, made.forcerange = 1, limits[0]

@@ -134,8 +134,9 @@ def count_spikes(spikes: Mapping[str, Mask], channels: Mapping[str, Array | None
 
 LONGEST_STUCK_S = 2.0
 """Longest time for which a reading may repeat [s]."""
-MOVED, MOVED_NM = 0.1, 0.2
-"""Least change of the model torque meanwhile: as a share of its range, and [N·m]."""
+MOVED, STEPS = 0.1, 2.0
+"""Least change of the model torque meanwhile: as a share of its range, and in least steps of the reading, one of which
+it may not see; the other is for the model's error."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,8 @@ def stuck_intervals(time: Array, model: Array, held: Mask, t: Array, reading: Ar
     changes = np.flatnonzero(np.diff(reading) != 0.0)
     starts, ends = np.r_[0, changes + 1], np.r_[changes, len(reading) - 1]
     out = []
-    least = max(MOVED * float(np.ptp(model)), MOVED_NM)
+    steps = np.abs(np.diff(np.unique(reading)))
+    least = max(MOVED * float(np.ptp(model)), STEPS * float(steps.min(initial=np.inf)) if len(steps) else 0.0)
     long = t[ends] - t[starts] >= LONGEST_STUCK_S
     for a, b in zip(starts[long].tolist(), ends[long].tolist(), strict=True):
         natural = len(changes) > 0 and (reading[a] == 0.0 or abs(reading[a]) >= np.abs(reading).max())

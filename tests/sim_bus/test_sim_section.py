@@ -112,6 +112,24 @@ def test_stops_of_the_arm_file_come_before_those_of_a_model_file(tmp_path: Path,
     np.testing.assert_allclose([plant.lower, plant.upper], [[-0.5], [0.8]])
 
 
+def test_drives_take_nothing_from_the_defaults_of_a_model_file(tmp_path: Path) -> None:
+    """Of dm_control's manipulator they would have asked for a control range; a gear of 12 would multiply torques."""
+    body = """<worldbody><body><joint name="hinge" type="hinge" axis="0 1 0" range="-1 1"/>
+        <inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>"""
+    defaults = """<default><general ctrllimited="true" gear="12" armature="0.3" damping="4" dyntype="filter"/>
+        <joint stiffness="5" damping="0.2" armature="0.1"/></default>"""
+    controllers = [{"name": "hinge", "node": 3, "rated_torque": 20.0, "max_torque": 30.0}]
+    kinematics = {"gravity": [0.0, 0.0, -9.81], "model": "arm.xml"}
+    soft = [{"effect": "transmission.elasticity", "joint": "hinge", "stiffness": 300.0}]
+    content = {"name": "one", "kinematics": kinematics, "link": {"joints": controllers}, "sim": {"effects": soft}}
+    (tmp_path / "arm.xml").write_text(f"<mujoco>{defaults}{body}</mujoco>")
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    built = SimulatedArm(described, Truth.of(described)).plant.model
+    assert built.actuator_gear[:, 0].tolist() == [1.0]
+    assert not built.actuator_ctrllimited.any()
+    assert not np.any(built.jnt_stiffness[built.joint("rotor hinge").id])
+
+
 def test_truth_is_drawn_within_its_ranges_and_frozen() -> None:
     arm = load_arm("sarcos")
     rated = arm.require_link().rated_torques

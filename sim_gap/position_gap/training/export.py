@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
 from calib.arm.urdf import xml_comment
 from gcomp.arrays import Array, Mask
@@ -198,7 +199,7 @@ def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int
         limited = [a.ctrlrange for a in old[:1] if a.ctrlrange[0] < a.ctrlrange[1]]
         for actuator in old:
             spec.delete(actuator)
-        made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made = add_actuator(spec, name, joint)
         gains = {"kp": point["kp"] * point["gain"], "kv": point["back_emf"] + min(point["kv"], point["viscous"])}
         if optional:
             made.set_to_pid(**gains, ctrlspec=1, **optional)  # its only input is a position

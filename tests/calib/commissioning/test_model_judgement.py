@@ -13,7 +13,14 @@ from armlink.errors import BadInput
 from calib.commissioning.chain import find_chains, model_joints
 from calib.commissioning.doctor import examine
 from calib.commissioning.draft import LOAD_FACTOR, draft_of_model
-from calib.commissioning.model_checks import gravity_need, model_errors, model_findings, refuse_impossible_model
+from calib.commissioning.model_checks import (
+    gain_errors,
+    gravity_need,
+    model_errors,
+    model_findings,
+    refuse_impossible_model,
+    refuse_impossible_sweep,
+)
 from calib.commissioning.new_arm import NewArm, new_arm
 from gcomp.arm.load import ModelArm, load_model
 from gcomp.gravity.torque import gravity_torque
@@ -116,6 +123,19 @@ def test_an_arm_whose_axes_are_all_vertical_has_nothing_to_calibrate_by(seed: in
     assert flat.kinematics is not None
     inclined = flat.kinematics.model_copy(update={"gravity": (6.9, 0.0, -6.9)})
     refuse_impossible_model(flat.model_copy(update={"kinematics": inclined}))
+
+
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("seed", range(3))
+def test_axes_that_meet_in_one_point_give_no_gains(seed: int, tmp_path: Path) -> None:
+    """A finger, or a wrist without the arm: a mass farther out looks like a sensor that reads high."""
+    model = DrawnModel(seed, mass_factor=0.1).write(tmp_path)
+    assert not list(gain_errors(drafted(model).parsed()))
+    model.write_text(re.sub('<origin xyz="[^"]*"/><axis', '<origin xyz="0 0 0"/><axis', model.read_text()))
+    wrist = drafted(model, {f"joint_{i}": 500.0 for i in range(9)}).parsed()
+    assert len(list(gain_errors(wrist))) == 1
+    with pytest.raises(BadInput, match="axes of all joints that gravity loads pass through one point"):
+        refuse_impossible_sweep(wrist, 0.0)
 
 
 @pytest.mark.sample(2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sweep_arms import at_rate, random_arm, with_section
 
-from armlink.arm_file import ArmFile, Tool
+from armlink.arm_file import ArmFile, Tool, parse_arm
 from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
@@ -184,6 +184,25 @@ def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> Non
     assert stops[slip.value.joint] != 0
     mover.hold_all()
     mover.cycle()
+
+
+def test_a_drive_that_could_push_into_the_stop_presses_no_harder_than_its_bias() -> None:
+    """A light joint with a strong drive: its position loop follows into the stop, which yields by 13 mrad."""
+    drive = {"name": "hinge", "node": 5, "rated_torque": 10.0, "max_torque": 10.0, "max_velocity": 1.0}
+    content = {
+        "name": "light",
+        "kinematics": {"gravity": [0.0, -9.81, 0.0], "joints": [{"name": "hinge", "lower": -1.0, "upper": 1.0}]},
+        "link": {"rate": 250, "joints": [drive]},
+        "sim": {"links": [{"mass": 0.05, "com": [0.02, 0.0, 0.0], "inertia": [1e-4, 1e-4, 1e-4]}]},
+    }
+    arm = parse_arm(content, Path("light.yaml"))
+    with enabled(SimulatedArm(arm, Truth.draw(arm, 3), 3)) as link:
+        mover = Mover(link, sweep_section(arm), DriveLimits.of(arm))
+        mover.hold_all()
+        mover.travel(np.array([0.98]), 1.0)
+        mover.press(np.array([1]), np.array([1.0]))
+        pressed = [mover.cycle() for _ in range(100)][-1]
+        assert pressed.motor_torque[0] == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_slower(chain: Chain) -> None:

@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.residuals.channel_quality import spikes_of
+from sim_gap.residuals.channel_quality import spikes_of, stuck_intervals
 
 RATE = 250.0
 T = np.arange(0.0, 40.0, 1.0 / RATE)
@@ -74,3 +74,13 @@ def test_the_diagnosis_is_the_same_and_says_how_many_samples_it_left_out():
     told = [int(note.split(": ")[1].split()[0]) for note in answer.notes if "left out as spikes" in note]
     assert sum(told) == pytest.approx(count, rel=0.05)
     assert not any("spikes" in note for note in clean.notes)
+
+
+@pytest.mark.parametrize(("step", "count"), [(0.3, 0), (0.01, 1)])
+def test_a_reading_may_repeat_while_torque_changes_by_less_than_its_step(step, count):
+    t = np.arange(0.0, 20.0, 0.01)
+    model = 0.5 * np.sin(0.3 * t)
+    reading = step * np.round(model / step)
+    if count:
+        reading[700:1100] = reading[700]
+    assert len(stuck_intervals(t, model, np.zeros(len(t), bool), t, reading)) == count
