@@ -41,8 +41,9 @@ drives: published arms have up to 6; placeholders, and limits copied from larger
 FRICTION = 0.02
 """Coulomb friction of the simulated arm, as a share of the torque that its drives need; assumed."""
 ROTOR = 1e-3
-"""Rotor inertia behind the gear of the simulated arm, for the torque that its drives need [s²], where the model has
-none; assumed. Published models have 0.3 (iiwa) to 10 (SO-100) thousandths, the Panda 1.1."""
+"""Rotor inertia behind the gear of the simulated arm over its drive's rated torque [s²], where the model has none;
+assumed. Published models have 0.3 (iiwa) to 10 (SO-100) thousandths, the Panda 1.1. A strong drive without its rotor
+would throw a light joint."""
 
 
 @dataclass
@@ -210,7 +211,7 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
         max_torque_rate=float(f"{effort / RATE_TIME:.3g}"),
         max_velocity=round(speed, 4),
         friction=float(f"{FRICTION * min(effort, rating.needed):.4g}"),
-        rotor=0.0 if joint.armature > 0 else float(f"{ROTOR * min(effort, rating.needed):.2g}"),
+        rotor=0.0 if joint.armature > 0 else float(f"{ROTOR * effort:.2g}"),
         stops=stops,
         notes=notes,
     )
