@@ -264,15 +264,16 @@ def compile_model(path: Path) -> Any:
 
 def read_spec(path: Path) -> Any:
     """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
-    locked: dict[str, float] = {}
     if is_arm_file(path):
-        nominal = nominal_model(path)
+        nominal, kinematics = nominal_model(path), load_arm(str(path)).kinematics
         if not isinstance(nominal, Path):
             return nominal
-        path, locked = nominal, load_arm(str(path)).kinematics.locked
+        spec = read_model(nominal, kinematics.locked).spec
+        spec.option.gravity = kinematics.gravity  # as it is mounted
+        return spec
     if not path.is_file():
         raise BadInput(f"there is no model file {path}: give an MJCF, URDF or arm file")
-    return read_model(path, locked).spec
+    return read_model(path).spec
 
 
 def urdf_behind(path: Path | None) -> Path | None:

@@ -1,5 +1,6 @@
 """Models as people have them: grippers, mimic joints, absent meshes, and the arm file of the same model."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,15 @@ def test_a_gripper_is_locked_where_the_recording_has_none():
     assert load_model(ARM4, (), 4).n == 4
 
 
-def test_the_arm_file_of_a_model_gives_the_same_torque(tmp_path):
-    document = {"name": "a", "kinematics": {"model": str(ARM4)}, "sim": {}}
+@pytest.mark.parametrize("gravity", [[0.0, 0.0, -9.81], [9.81, 0.0, 0.0]])
+def test_the_arm_file_of_a_model_gives_the_same_torque(gravity, tmp_path):
+    """Under the gravity of the arm file: the arm may hang on a wall."""
+    document = {"name": "a", "kinematics": {"model": str(ARM4), "gravity": gravity}, "sim": {}}
     arm_file = tmp_path / "a.yaml"
     arm_file.write_text(yaml.safe_dump(document))
-    np.testing.assert_allclose(torque(load_model(arm_file, (), 4)), torque(load_model(ARM4, (), 4)), atol=1e-9)
+    alone = load_model(ARM4, (), 4)
+    turned = replace(alone, arm=replace(alone.arm, gravity=np.array(gravity)))
+    np.testing.assert_allclose(torque(load_model(arm_file, (), 4)), torque(turned), atol=1e-9)
 
 
 def test_a_mass_that_comes_from_an_absent_mesh_is_one_line(tmp_path):
