@@ -17,6 +17,8 @@ from sim_bus.sim_section import LinkBody, SimSection, sim_section
 STOP_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Solver impedance, close enough to 1 that creep under stiction is a few µrad/s."""
+MOST_DAMPING = 0.5
+"""Share of a drive's largest torque that a model's viscous friction may take at the largest velocity."""
 TINY_INERTIA = 1e-9
 DEGREE = np.pi / 180
 
@@ -99,8 +101,8 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
     drives = {} if arm.link is None else {drive.name: drive for drive in arm.link.joints}
     for joint in spec.joints:
         drive = drives.get(joint.name)
-        if drive is not None and np.sum(joint.damping) * drive.max_velocity > drive.max_torque:
-            joint.damping = 0.0 * joint.damping  # a placeholder: the drive could not move the joint
+        if drive is not None and np.sum(joint.damping) * drive.max_velocity > MOST_DAMPING * drive.max_torque:
+            joint.damping = 0.0 * joint.damping  # a simulator's stabiliser: it would leave the drive too little to lift
         if joint.name in arm.kinematics.stops:
             joint.range = np.array(arm.kinematics.stops[joint.name]) / (DEGREE if joint.compiler.degree else 1.0)
         if joint.type != mujoco.mjtJoint.mjJNT_HINGE or joint.range[0] >= joint.range[1]:

@@ -70,6 +70,7 @@ class Plant:
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
+        self._springs = self.model.jnt_stiffness[self._joints].copy(), self.model.qpos_spring[self._dof].copy()
         self._gearing = state.gearing
         self._gears = Transmissions(self.model, names, state) if state.gearing else None
 
@@ -117,8 +118,9 @@ class Plant:
         self._seat("armature", self._rotor_inertia)
         self._seat("damping", self._viscous)
         self.model.opt.gravity[:] = _tilted(imperfections.tilt).T @ self._gravity
-        self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
-        self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
+        (own, own_rest), (added, rest) = self._springs, imperfections.spring.T
+        self.model.jnt_stiffness[self._joints] = own + added
+        self.model.qpos_spring[self._dof] = (own * own_rest + added * rest) / np.where(own + added > 0, own + added, 1)
         self._bodies.turn_frames(imperfections)
         self._bodies.weigh(self._imperfections, self._attached)
         self._cables = None

@@ -82,7 +82,7 @@ def test_torque_ends_where_the_drives_of_the_arm_file_end_not_the_effort_of_the_
     np.testing.assert_allclose(plant.data.qfrc_actuator, [25.0, 20.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("damping", "taken"), [(2.0, 2.0), (40.0, 0.0)])
+@pytest.mark.parametrize(("damping", "taken"), [(2.0, 2.0), (20.0, 0.0), (40.0, 0.0)])
 def test_damping_that_no_drive_of_the_arm_could_move_is_a_placeholder(
     tmp_path: Path, damping: float, taken: float
 ) -> None:
@@ -110,6 +110,20 @@ def test_stops_of_the_arm_file_come_before_those_of_a_model_file(tmp_path: Path,
     described = parse_arm(content, tmp_path / "arm.yaml")
     plant = SimulatedArm(described, Truth.of(described)).plant
     np.testing.assert_allclose([plant.lower, plant.upper], [[-0.5], [0.8]])
+
+
+def test_a_spring_of_a_model_file_is_one_of_the_arm(tmp_path: Path) -> None:
+    joint = '<joint name="hinge" axis="0 1 0" range="-1 1" stiffness="10" springref="30"/>'
+    body = f'<body>{joint}<inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body>'
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    controllers = [{"name": "hinge", "node": 3, "rated_torque": 20.0, "max_torque": 30.0}]
+    kinematics = {"gravity": [0.0, 0.0, -9.81], "model": "arm.xml"}
+    cable = [{"effect": "transmission.spring", "joint": "hinge", "stiffness": 30.0, "rest": -0.1}]
+    content = {"name": "one", "kinematics": kinematics, "link": {"joints": controllers}, "sim": {"effects": cable}}
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    built = SimulatedArm(described, Truth.of(described)).plant.model
+    assert built.jnt_stiffness.tolist() == [40.0]
+    assert built.qpos_spring == pytest.approx([(10.0 * np.pi / 6 - 30.0 * 0.1) / 40.0])
 
 
 def test_drives_take_nothing_from_the_defaults_of_a_model_file(tmp_path: Path) -> None:
