@@ -131,8 +131,8 @@ class PlannedArm:
         return float(np.clip(np.min(spare / np.maximum(2 * self.guess.inertia(), 1e-9)), SLOWEST, FASTEST))
 
 
-def nearest_first(poses: Array, begin: Array) -> Array:
-    """The same poses (K, n) [rad], each followed by the nearest of the remaining ones, from `begin` (n,) on."""
+def nearest_first(poses: Array, begin: Array) -> list[int]:
+    """The places of poses (K, n) [rad], each followed by the nearest of the remaining ones, from `begin` (n,) on."""
     left, way = list(range(len(poses))), []
     here = begin
     while left:
@@ -140,4 +140,4 @@ def nearest_first(poses: Array, begin: Array) -> Array:
         left.remove(nearest)
         way.append(nearest)
         here = poses[nearest]
-    return poses[way]
+    return way

@@ -3,6 +3,8 @@
 And poses that tell most of the masses, for the scout and for weighing, in an order with little travel.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from armlink.arm_file import ArmFile
@@ -28,9 +30,9 @@ def scout_poses(planned: PlannedArm, seed: int) -> Poses:
     """
     count = planned.arm.n + 3
     poses = planned.free_poses(2 * count, np.random.default_rng(seed))
-    chosen = _informative_poses(planned, poses, gravity_regressor(planned.arm, poses), 10.0, count)
     middle = np.mean([planned.sweep_range(joint) for joint in range(planned.arm.n)], axis=1)
-    return tuple(tuple(pose.tolist()) for pose in nearest_first(chosen, middle))
+    chosen = _informative_poses(planned, poses, gravity_regressor(planned.arm, poses), 10.0, count, middle)
+    return tuple(tuple(pose.tolist()) for pose in chosen)
 
 
 def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
@@ -41,16 +43,26 @@ def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Ar
     planned = PlannedArm(arm_file)
     poses = planned.free_poses(count, np.random.default_rng([seed, 8]))
     columns = gravity_regressor(planned.arm, poses) @ np.column_stack(payload_columns(planned.arm))
-    return nearest_first(_informative_poses(planned, poses, columns, 1.0, count), begin)
+    return _informative_poses(planned, poses, columns, 1.0, count, begin)
 
 
-def _informative_poses(planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int) -> Array:
+def _informative_poses(
+    planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int, begin: Array
+) -> Array:
     """The poses (count, n) that tell most (D-optimal) of unknowns with these columns (P, n, p) of torque and of every
-    joint's offset, in units of `offset` [N·m]."""
+    joint's offset, in units of `offset` [N·m]; from `begin` (n,) on each is near to the one before.
+
+    Poses on whose way something touches give their place to others, as long as there are any.
+    """
     offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
-    rows = np.concatenate([columns, offsets], axis=2) / planned.limits.rated[:, None]
-    (chosen,) = select([rows[None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
-    return poses[chosen]
+    rows, left = np.concatenate([columns, offsets], axis=2) / planned.limits.rated[:, None], np.arange(len(poses))
+    while True:
+        (chosen,) = select([rows[left][None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
+        order = left[chosen][nearest_first(poses[left[chosen]], begin)]
+        blocked = [goal for here, goal in pairwise(order) if not planned.is_clear(poses[here], poses[goal])]
+        left = np.setdiff1d(left, blocked)
+        if not blocked or len(left) < count:
+            return poses[order]
 
 
 def sweep_options(planned: PlannedArm) -> tuple[list[Candidates], list[str]]:

@@ -194,7 +194,8 @@ def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
 
 def verify_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
     """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
-    return nearest_first(PlannedArm(arm_file).drawn_poses(count, np.random.default_rng([seed, 6])), begin)
+    poses = PlannedArm(arm_file).drawn_poses(count, np.random.default_rng([seed, 6]))
+    return poses[nearest_first(poses, begin)]
 
 
 def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> Array:
@@ -210,7 +211,7 @@ def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> 
             if len(found) == count:
                 break
     if creeping.geometry is None and found:
-        return nearest_first(np.array(found), begin)
+        return np.array(found)[nearest_first(np.array(found), begin)]
     return np.array(found)
 
 

@@ -46,6 +46,8 @@ def test_a_way_that_touches_is_refused_with_bodies_and_pose(tmp_path: Path) -> N
                 match=r"touch \w+ on the way to pose \d of the rough gravity model, \d+\.\d mm deep, at -?\d",
             ):
                 check_plan(arm, plan)
+            scouted = [pose for where, pose in poses_along(plan_sweep(arm)) if "rough gravity model" in where]
+            assert Geometry(arm).free(np.array(scouted)).all()  # a plan of this arm goes by other poses
             return
     pytest.fail("no way of this plan is clear of all its places")
 
