@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
+from calib.plan.collisions import sweep_ends
 from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.planned_arm import SLOWEST, PlannedArm
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
@@ -118,7 +119,8 @@ def plan_sweep(
     `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing; `resolution` (n,) [rad] that of the
     position readings, if known. Without `guess` nothing is known of the masses and no bias torque is set. With the
     scout's guess, combinations that cannot be held within max_torque are left out, the others get their bias torques,
-    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Raises BadInput if a
+    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Combinations on whose way
+    something touches give their place to others, as long as a joint has any. Raises BadInput if a
     joint's range is too short to sweep or no combination can be held.
     """
     planned = PlannedArm(arm_file, guess).require_range()
@@ -130,16 +132,22 @@ def plan_sweep(
     masses = [given] if given else reference_masses(planned, reached)
     poses = section.loaded_poses if reference_mass else section.poses
     scout = scout_poses(planned, seed)
-    design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
-    tried = []
-    for more in range(MORE_POSES + 1):
-        sweeps = _choose(planned, design, poses + more)
-        tried.append((sweeps, *_lightest(planned, sweeps, scout, masses, resolution)))
-        if tried[-1][-1] is None or tried[-1][-1] <= FINEST * goal:
+    while True:
+        design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
+        tried = []
+        for more in range(MORE_POSES + 1):
+            sweeps = _choose(planned, design, poses + more)
+            tried.append((sweeps, *_lightest(planned, sweeps, scout, masses, resolution)))
+            if tried[-1][-1] is None or tried[-1][-1] <= FINEST * goal:
+                break
+        else:
+            tried = tried[:1]  # none more where those do not suffice
+        sweeps, mass, gain_std = tried[-1]
+        blocked = _first_blocked(planned, np.array(scout[-1]), sweeps)
+        left = options if blocked is None else [_without(each, blocked) for each in options]
+        if left is options or not all(each.count for each in left):
             break
-    else:
-        tried = tried[:1]  # none more where those do not suffice
-    sweeps, mass, gain_std = tried[-1]
+        options = left
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
@@ -177,6 +185,23 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
             f"--reference-mass {mass:g}: with this mass no sweep of {name} stays within max_torque: attach "
             f"at most {float(f'{most[name]:.2g}'):g} kg{unit}"
         )
+
+
+def _first_blocked(planned: PlannedArm, here: Array, sweeps: Sequence[Sweep]) -> Sweep | None:
+    """The first sweep on whose way, from `here` (n,) [rad] or from the sweep before, something touches."""
+    for sweep in sweeps:
+        begin, _ = sweep_ends(sweep)
+        if not planned.is_clear(here, begin):
+            return sweep
+        here = begin
+    return None
+
+
+def _without(options: Candidates, sweep: Sweep) -> Candidates:
+    """The combinations without that of a sweep."""
+    if options.joint != sweep.joint:
+        return options
+    return options.kept((options.stops != np.array(sweep.stops)).any(axis=1))
 
 
 def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep, ...]:
