@@ -293,7 +293,7 @@ class Policy:
         if not frame.after <= self._acknowledged:
             return (
                 f"the program sent {can_id:X}h, but the drive has not acknowledged the settings of this frame "
-                "since it or the guard started: set up the arm again"
+                "since the drive or the guard started: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:

@@ -168,7 +168,7 @@ def integrated(track: ScaleTrack) -> Evidence | None:
     scatter = 1.483 * _median(np.abs(summed / turned - ratio), np.abs(turned))
     text = f"the velocity, integrated over {way:.2f} rad of motion, gives {ratio * way:.2f} rad"
     if ratio <= 0 or scatter > UNSTEADY * abs(ratio):
-        return Evidence(f"{text}, unsteadily (± {scatter / max(abs(ratio), 1e-9):.0%})", -1.0, FLOOR, {"velocity": -1})
+        return Evidence(f"{text}, scattering by {scatter / max(abs(ratio), 1e-9):.0%}", -1.0, FLOOR, {"velocity": -1})
     sigma = max(FLOOR, scatter / abs(ratio) / math.sqrt(len(turned)))
     return Evidence(text, ratio, sigma, {"position": 1, "velocity": -1})
 

@@ -221,8 +221,8 @@ def _sweeps(done: Calibrated, fit: SensorFit) -> list[ReportSection]:
             "cross-validation RMS [N·m]",
         )
         caption = (
-            "Cross-validation: RMS error of a fit without this sweep on this sweep, and its ratio to the "
-            "expected error."
+            "Cross-validation: RMS error on this sweep of a fit to all other sweeps, and the ratio of this error "
+            "to the expected error."
         )
         figures = [joint_figure(arm, fit, joint)] if rows else []
         made.append(
