@@ -214,7 +214,7 @@ def law(track: ScaleTrack) -> list[Evidence]:
         ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_FLOOR),
     ):
         if each.known:
-            text = f"the torque follows {each.value:.3g} times the commanded {name}"
+            text = f"the torque shows a {name} of {each.value:.3g} times the commanded {name}"
             found.append(Evidence(text, each.value, max(floor, 2 * each.sigma / each.value), exponents))
     return found
 

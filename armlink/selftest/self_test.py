@@ -267,7 +267,7 @@ class SelfTest:
     def _keeper(self, kept: list[int]) -> None:
         """No command for any joint: does the keeper hold those whose drives would keep on with their last one?"""
         link, loop = self.link, self.link.commander.loop
-        seconds, left = PATIENCE * link.section.deadline, "; if machine or cable fails, the last command goes on"
+        seconds, left = PATIENCE * link.section.deadline, "; if this machine or a cable fails, the last command goes on"
         if loop.keeper is None:
             for joint in kept:
                 told = f"its drive keeps on with its last command, and no keeper is needed in a simulation{left}"

@@ -99,7 +99,7 @@ def identify(
         used = current if current is not None and current.sources == sensors.sources else None
     else:
         if all_creep(sweeps):
-            raise BadInput("--calibration: creep sweeps give drives and gravity in one fit: leave this option out")
+            raise BadInput("--calibration: the fit of creep sweeps finds the calibration too: leave this option out")
         kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
             raise BadInput(f"--calibration {calibration}: this is a {kept.kind} record, expected a calibration record")

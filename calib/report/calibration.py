@@ -95,9 +95,7 @@ def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
         half[np.isfinite(half)],
         [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
     )
-    exactly = (
-        f"Torque gains are known to ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
-    )
+    exactly = f"Torque gain intervals: ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
     without = f"; the gains of {', '.join(unknown)} are not known, see below" if unknown else ""
     if broken:
         return paragraph(
