@@ -173,8 +173,8 @@ class MitDrives(BasicDrives[K]):
         most = grid.ranges.position
         if not (-most <= limits.lower and limits.upper <= most):
             raise BadInput(
-                f"{self.names[joint]}: its window of drive positions, {limits.lower:.2f} to {limits.upper:.2f} "
-                f"rad, exceeds the range of the drive's frames, ±{most:.2f} rad{where}: correct zero and "
+                f"{self.names[joint]}: its position window at the drive, {limits.lower:.2f} to "
+                f"{limits.upper:.2f} rad, exceeds the range of the drive's frames, ±{most:.2f} rad{where}: correct zero and "
                 "direction, or give the joint a smaller range"
             )
 
