@@ -174,8 +174,8 @@ class MitDrives(BasicDrives[K]):
         if not (-most <= limits.lower and limits.upper <= most):
             raise BadInput(
                 f"{self.names[joint]}: its position window at the drive, {limits.lower:.2f} to "
-                f"{limits.upper:.2f} rad, exceeds the range of the drive's frames, ±{most:.2f} rad{where}: correct zero and "
-                "direction, or give the joint a smaller range"
+                f"{limits.upper:.2f} rad, exceeds the range of the drive's frames, ±{most:.2f} rad{where}: "
+                "correct zero and direction, or give the joint a smaller range"
             )
 
 
