@@ -46,7 +46,7 @@ class HostLate(Stall):
         if late > limit or not then:
             super().__init__(f"{told} (limit {limit * 1e3:.0f} ms){then and f'; {then}'}")
         else:
-            super().__init__(f"{told}, which explains this: {then}")
+            super().__init__(f"{told}; the consequence: {then}")
         self.late, self.limit, self.then = late, limit, then
 
     def __reduce__(self) -> tuple[type["HostLate"], tuple[float, float, str]]:

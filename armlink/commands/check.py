@@ -197,7 +197,7 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     from armlink.selftest.host import measure_host
 
     with console.status(
-        f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, while another process computes"
+        f"{arm.name}: making cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, while another process computes"
     ):
         report = measure_host(arm, seconds)
     late, section = report.lateness.in_ms(), arm.require_link()

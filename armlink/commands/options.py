@@ -59,7 +59,7 @@ OF_READING: dict[str, tuple[Any, Any]] = {
     "sign": (Many, _of_reading("Sign of a channel or column: tau_3=-1.")),
     "zero": (Many, _of_reading("Angle to add to a position [rad]: q_2=1.5708.")),
     "clock": (Many, _of_reading("Time to add to a channel [s]: tau=-0.02.")),
-    "effort_is": (Text, _of_reading("The efforts: motor, link (sensor), without-gravity, or motor,without-gravity.")),
+    "effort_is": (Text, _of_reading("Kind of efforts: motor, link (sensor), without-gravity, motor,without-gravity.")),
     "topic": (Text, _of_reading("Topic of a bag with the joint states.")),
 }  # fmt: skip
 """Options that say how a recording is to be read: type and help of each."""

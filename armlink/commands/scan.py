@@ -18,7 +18,7 @@ def scan(
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:
-    """List the drives of all families that answer on a bus, or those of an arm and who does not answer (status 3).
+    """List the drives that answer on a bus, or the drives of an arm and which of them do not answer (status 3).
 
     Exit status 1 if a joint has another drive than the arm file states (link.joints, key identity).
 

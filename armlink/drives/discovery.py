@@ -76,7 +76,7 @@ class BusDrives:
         for name in filter(ways.__contains__, order):
             way, lack = ways[name], ""
             if family(name).traits.frame == "fd" and not searched.fd:
-                lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
+                lack = "the bus is classical CAN; CAN FD needs --bus INTERFACE:CHANNEL@1000000/5000000"
             if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
                 lack = f"requests to them could command the {beside.pop()} drives, or look like their frames"
             if lack:

@@ -173,9 +173,9 @@ class MitDrives(BasicDrives[K]):
         most = grid.ranges.position
         if not (-most <= limits.lower and limits.upper <= most):
             raise BadInput(
-                f"{self.names[joint]}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at "
-                f"the drive exceeds the range ±{most:.2f} rad of its frames{where}: correct zero and "
-                "direction, or give the joint a smaller range"
+                f"{self.names[joint]}: its position window at the drive, {limits.lower:.2f} to "
+                f"{limits.upper:.2f} rad, exceeds the range of the drive's frames, ±{most:.2f} rad{where}: "
+                "correct zero and direction, or give the joint a smaller range"
             )
 
 

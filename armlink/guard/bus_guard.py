@@ -110,7 +110,7 @@ class Field:
         if self._last is None:
             if value in self.first:
                 return ""
-            return f"{self.name} is {value} in a frame that gives power, but no reading of the joint is near it"
+            return f"{self.name} is {value} in a frame that gives power, but no reading of the joint is near this"
         if abs(value - self._last) <= self._room_at(now):
             return ""
         return f"{self.name} changes from {self._last} to {value} in one frame, limit {self._room_at(now):g}"
@@ -293,7 +293,7 @@ class Policy:
         if not frame.after <= self._acknowledged:
             return (
                 f"the program sent {can_id:X}h, but the drive has not acknowledged the settings of this frame "
-                "since it or the guard started: set up the arm again"
+                "since the drive or the guard started: set up the arm again"
             )
         power = frame.powers(data)
         for field in fields:
@@ -451,7 +451,7 @@ class BusGuard:
         then = "the joints were commanded to stop"
         if not all(told):
             then = "the stop commands could not be sent: the joints stop when their drives miss the host"
-        self._say(f"guard: closed, it passes no more frames: {why}; {then}; start the guard again to open it")
+        self._say(f"guard: closed, so it passes no more frames: {why}; {then}; start the guard again to open it")
 
 
 def _number(found: dict[str, Any]) -> struct.Struct:

@@ -321,7 +321,7 @@ class Loop:
                         inside = limits.lower <= order.position <= limits.upper or not order.kp > 0
                         within = inside and abs(torque) <= EXACT * limits.max_torque
                         if order.power is Power.ON and not within:
-                            raise Refused(f"keeper: the frame to {drives.where(joint)} exceeds a limit: not kept")
+                            raise Refused(f"keeper: the frame to {drives.where(joint)} exceeds a limit")
                     found.append((can_id | group.tag, data))
         return found
 

@@ -57,7 +57,7 @@ def _why_no_cycle(arm: ArmFile, log: LogReader) -> str:
         if paced and not any(can_id in log.ids for can_id in paced):
             absent.append(f"SYNC ({min(paced):03X}h)")
     if not absent:
-        return "the frames of every joint are there, but never of all of them in one cycle"
+        return "the log has frames of every joint, but no cycle with frames of all joints"
     seen = ", ".join(f"{can_id & 0x1FFFFFFF:03X}h" for can_id in sorted(log.ids)[:12])
     return f"no frame comes from {', '.join(absent)}; the log has the frames {seen}{' …' if len(log.ids) > 12 else ''}"
 

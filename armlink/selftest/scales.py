@@ -168,7 +168,7 @@ def integrated(track: ScaleTrack) -> Evidence | None:
     scatter = 1.483 * _median(np.abs(summed / turned - ratio), np.abs(turned))
     text = f"the velocity, integrated over {way:.2f} rad of motion, gives {ratio * way:.2f} rad"
     if ratio <= 0 or scatter > UNSTEADY * abs(ratio):
-        return Evidence(f"{text}, unsteadily (± {scatter / max(abs(ratio), 1e-9):.0%})", -1.0, FLOOR, {"velocity": -1})
+        return Evidence(f"{text}, scattering by {scatter / max(abs(ratio), 1e-9):.0%}", -1.0, FLOOR, {"velocity": -1})
     sigma = max(FLOOR, scatter / abs(ratio) / math.sqrt(len(turned)))
     return Evidence(text, ratio, sigma, {"position": 1, "velocity": -1})
 
@@ -214,7 +214,7 @@ def law(track: ScaleTrack) -> list[Evidence]:
         ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_FLOOR),
     ):
         if each.known:
-            text = f"the torque follows {each.value:.3g} times the commanded {name}"
+            text = f"the torque shows a {name} of {each.value:.3g} times the commanded {name}"
             found.append(Evidence(text, each.value, max(floor, 2 * each.sigma / each.value), exponents))
     return found
 

@@ -46,7 +46,7 @@ def announcement(arm: ArmFile) -> str:
         )
         if any(each.silence != each.reaction(keeper) for each in traits):
             steps += (
-                f" Last, no joint gets commands for {PATIENCE * deadline:.0f} ms: the keeper must hold every joint "
+                f" Finally, no joint gets commands for {PATIENCE * deadline:.0f} ms: the keeper must hold every joint "
                 "whose drive keeps on."
             )
     end = "the joints hold, in quick stop"
@@ -267,7 +267,7 @@ class SelfTest:
     def _keeper(self, kept: list[int]) -> None:
         """No command for any joint: does the keeper hold those whose drives would keep on with their last one?"""
         link, loop = self.link, self.link.commander.loop
-        seconds, left = PATIENCE * link.section.deadline, "; a dead machine or a pulled cable leaves the last command"
+        seconds, left = PATIENCE * link.section.deadline, "; if this machine or a cable fails, the last command goes on"
         if loop.keeper is None:
             for joint in kept:
                 told = f"its drive keeps on with its last command, and no keeper is needed in a simulation{left}"
@@ -279,7 +279,7 @@ class SelfTest:
         moved = np.abs(np.array(loop.latest_position) - standing)
         for joint in kept:
             heard = "sent its frames" if loop.keeper.heard else "was not heard"
-            told = f"its keeper {heard} within {seconds * 1e3:.0f} ms, and it moved by {moved[joint]:.4f} rad{left}"
+            told = f"its keeper {heard} within {seconds * 1e3:.0f} ms; the joint moved by {moved[joint]:.4f} rad{left}"
             self.checks.judge(link.names[joint], "silence", loop.keeper.heard and bool(moved[joint] < HELD), told)
         link.commander.settle()
         link.commander.walk(Power.ON)

@@ -19,7 +19,7 @@ def hold_afloat(
     seconds: Annotated[float, typer.Option(min=0.0, help="Duration [s]; 0: until Ctrl-C.")] = 0.0,
     record: Annotated[
         str | None,
-        typer.Option(help="Id of a gravity record; by default the current one, or else the inertials of the model."),
+        typer.Option(help="Id of a gravity record; default: the current record or, if none, the model's inertials."),
     ] = None,
     tool: Tool = None,
     store: Store = None,

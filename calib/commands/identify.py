@@ -49,7 +49,7 @@ def identify(
         float | None,
         typer.Option(
             min=0.0,
-            help="Standard deviation of torque gains from 1; by default 0.03 for sensors, 0.5 for motor currents.",
+            help="How far torque gains may be from 1 (standard deviation); default: 0.03 (sensors), 0.5 (currents).",
             rich_help_panel=POSES,
         ),
     ] = None,
@@ -60,7 +60,7 @@ def identify(
         Path | None, typer.Option(help="Also write base parameters as YAML for ROS 2.", rich_help_panel=POSES)
     ] = None,
     plan: Annotated[
-        int, typer.Option(min=0, max=100, help="Also list this many further poses.", rich_help_panel=POSES)
+        int, typer.Option(min=0, max=100, help="Also list this many new poses that help most.", rich_help_panel=POSES)
     ] = 0,
     store: Store = None,
     json_file: JsonFile = None,
@@ -99,7 +99,7 @@ def identify(
         used = current if current is not None and current.sources == sensors.sources else None
     else:
         if all_creep(sweeps):
-            raise BadInput("--calibration: creep sweeps give drives and gravity in one fit: leave this option out")
+            raise BadInput("--calibration: the fit of creep sweeps finds the calibration too: leave this option out")
         kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
             raise BadInput(f"--calibration {calibration}: this is a {kept.kind} record, expected a calibration record")

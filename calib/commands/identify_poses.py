@@ -134,7 +134,7 @@ def identify_poses(
         out.print(f"record {record} is current")
     if out_model is not None and described.placed is not None and described.path is not None:
         write_model(described.placed, described.path, fit.gravity.beta, out_model)
-        out.print(f"{out_model}: the model with these mass moments, in physically possible bodies")
+        out.print(f"{out_model}: the model with these mass moments; all its bodies are physically possible")
     if options.coefficients is not None:
         write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, options.coefficients)
         out.print(f"{options.coefficients}: base parameters, and the names of the regressor's columns")

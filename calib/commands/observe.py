@@ -68,7 +68,7 @@ def observe(
     changes = [each for each in told if each["kind"] in CHANGES]
     for each in changes:
         out.print(f"{each['t']:.1f} s: {each['text']}")
-    out.print(f"{len(changes)} changes in {last - first:.1f} s of work ({rows} samples, {observer.rows} rows judged)")
+    out.print(f"{len(changes)} changes in {last - first:.1f} s of work ({rows} samples, {observer.rows} measurements)")
     answer = {
         "schema": "armlink.observe/1",
         "records": {"calibration": calibration.id, "gravity": gravity.id},

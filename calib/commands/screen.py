@@ -104,7 +104,7 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(f"{motion}. {question}")
         return []
-    return [f"{motion}. {question} Without a terminal nobody is asked, and it moves now"]
+    return [f"{motion}. {question} Without a terminal nobody is asked, and the arm moves now"]
 
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
@@ -177,7 +177,7 @@ def stall_lines(data: "SweepData") -> list[str]:
         return []
     places = list(dict.fromkeys(_place(stall.reading) for stall in data.stalls))
     often = "once" if len(data.stalls) == 1 else f"{len(data.stalls)} times"
-    return [f"the joints were stopped {often}, and this was repeated: {'; '.join(places)}"]
+    return [f"the joints were stopped {often}; these readings were repeated: {'; '.join(places)}"]
 
 
 def _place(reading: str) -> str:

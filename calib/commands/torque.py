@@ -19,7 +19,7 @@ def torque(
     tip: ChainTip = None,
     record: Annotated[
         str | None,
-        typer.Option(help="Id of a gravity record; by default the inertials of the model, or else the current record."),
+        typer.Option(help="Id of a gravity record; default: the model's inertials or, if none, the current record."),
     ] = None,
     tool: Tool = None,
     store: Store = None,

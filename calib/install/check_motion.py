@@ -93,7 +93,7 @@ class CheckMotion:
             if abs(away) > self._floor[j]:
                 return (
                     f"{name}: its readings after the write differ by {away:+.3f} N·m from its readings before the "
-                    "write, when these are converted with the new calibration"
+                    "write, converted with the new calibration"
                 )
         return None
 

@@ -83,7 +83,7 @@ class Geometry:
                 )
                 raise BadInput(
                     f"{arm_file.path}: key sweep.beside: pose: joint {name!r} {what}: give only joints of other "
-                    "arms, which rest"
+                    "arms, which stay at rest"
                 )
             self.data.qpos[self.model.jnt_qposadr[place]] = angle
 

@@ -95,9 +95,7 @@ def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
         half[np.isfinite(half)],
         [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
     )
-    exactly = (
-        f"Torque gains are known to ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
-    )
+    exactly = f"Torque gain intervals: ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
     without = f"; the gains of {', '.join(unknown)} are not known, see below" if unknown else ""
     if broken:
         return paragraph(
@@ -221,8 +219,8 @@ def _sweeps(done: Calibrated, fit: SensorFit) -> list[ReportSection]:
             "cross-validation RMS [N·m]",
         )
         caption = (
-            "Cross-validation: RMS error of a fit without this sweep on this sweep, and its ratio to the "
-            "expected error."
+            "Cross-validation: RMS error on this sweep of a fit to all other sweeps, and the ratio of this error "
+            "to the expected error."
         )
         figures = [joint_figure(arm, fit, joint)] if rows else []
         made.append(

@@ -165,8 +165,8 @@ def creep_complaint(
         return None
     worst = int(np.argmax(found.rms / found.tolerance))
     return (
-        f"{found.names[worst]}: in the check motion {found.rms[worst]:.3f} N·m RMS against the model, allowed"
-        f" {found.tolerance[worst]:.3f}"
+        f"{found.names[worst]}: in the check motion the RMS difference to the model is {found.rms[worst]:.3f} N·m, "
+        f"allowed {found.tolerance[worst]:.3f} N·m"
     )
 
 

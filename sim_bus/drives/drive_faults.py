@@ -23,10 +23,10 @@ DRIVE_KINDS = {
         FaultKind("drive.trip", True, "", 0.0, "the drive's watchdog trips although its host is there"),
         FaultKind("drive.latched", True, "", 0.0, "the drive's watchdog trips, and only a power cycle clears it"),
         FaultKind("drive.mode", True, "mode", 2.0, "the drive changes to this mode of control"),
-        FaultKind("drive.classic", True, "", 0.0, "the drive answers CAN FD frames by classical ones"),
-        FaultKind("scale.position", True, "factor", 1.25, "positions are coded with a range larger than reported"),
-        FaultKind("scale.velocity", True, "factor", 1.25, "velocities are coded with a range larger than reported"),
-        FaultKind("scale.torque", True, "factor", 1.25, "torques are coded with a range larger than reported"),
+        FaultKind("drive.classic", True, "", 0.0, "the drive answers CAN FD frames with classical frames"),
+        FaultKind("scale.position", True, "factor", 1.25, "positions have a larger range than the drive reports"),
+        FaultKind("scale.velocity", True, "factor", 1.25, "velocities have a larger range than the drive reports"),
+        FaultKind("scale.torque", True, "factor", 1.25, "torques have a larger range than the drive reports"),
         FaultKind("feedback.lost", True, "", math.inf, "the drive has lost its encoder, or sends no feedback"),
         FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted and does nothing"),
     )
@@ -45,7 +45,7 @@ def _kind(how: str, quantity: str) -> FaultKind:
         "frozen": ("", 0.0, f"the reported {quantity} no longer changes"),
         "scaled": ("factor", 2.0, f"the reported {quantity} is the true one times this factor"),
         "forged": (f"{quantity} [{unit}]", 0.0, f"a second node repeats the joint's frames with this {quantity}"),
-        "doubled": ("", 0.0, f"a second node repeats the joint's frames with the {quantity} that they had at first"),
+        "doubled": ("", 0.0, f"a second node repeats the joint's frames with the {quantity} of the first frame"),
     }[how]
     return FaultKind(f"{how}.{quantity}", True, value, default, does)
 

@@ -167,8 +167,8 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
     """A note for the rows with the largest remaining gaps, and the regime of motion of each."""
     above = [row for row, rms in row_rms(data, left).items() if rms > data.margin[row]]
     return tuple(
-        f"{at.joint}: a gap of {at.rms:.2g} N·m in {at.channel} remains (noise {at.noise:.2g}), "
-        + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
+        f"{at.joint}: a gap of {at.rms:.2g} N·m in {at.channel} remains (noise {at.noise:.2g} N·m), "
+        + ("in no clear regime of motion" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
         for at in (locate(data, left, above)[:3] if above else [])
     )
 
@@ -210,7 +210,7 @@ def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, .
     return tuple(
         f"{names[law.joint]}: the remaining gap in {law.channel} depends on the joint's {law.quantity}"
         + (", directed against the motion" if law.directed else "")
-        + f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); "
+        + f"; this law reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m, and "
         "no known effect explains it"
         for law in laws
     )

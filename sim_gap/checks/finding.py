@@ -37,7 +37,7 @@ class RecordingFinding:
         if not self.corrected:
             return f"{self.evidence_at} – diagnosed as recorded; to change this: {self.option}"
         other = f"option: {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
-        return f"{self.evidence_at} – accounted for; {other}"
+        return f"{self.evidence_at} – corrected; {other}"
 
     def to_json(self) -> dict[str, Any]:
         return dict(vars(self))

@@ -161,7 +161,7 @@ def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Ite
                 part = f"in the part {'after' if late else 'before'} {share:.0%} of the recording"
                 yield replace(
                     whole,
-                    what=f"{whole.what}, but only {part}: the model then explains more",
+                    what=f"{whole.what}, but only {part}: with this change the model explains more",
                     option=f"give both parts as separate recordings, the {'later' if late else 'earlier'} part with "
                     f"{whole.option}",
                     change=partial(_in_part, order=order, late=late, share=share),

@@ -36,7 +36,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
 ) -> None:
-    """Make sealed cases, diagnose them with the true effect known and with it unknown, open the labels and score.
+    """Make sealed cases, diagnose them with and without the true effect in the library, open the labels and score.
 
     Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
 
@@ -81,7 +81,7 @@ def bench(
 
 
 ROWS = (
-    ("right effect first, if the recording can separate it", "label_withheld", "first_right_where_tellable"),
+    ("right effect first, if the motion can distinguish it", "label_withheld", "first_right_where_tellable"),
     ("right effect first", "label_withheld", "first_right"),
     ("right effect first or named as confounded", "label_withheld", "first_or_confounded"),
     ("an extra cause claimed with confidence", "label_withheld", "extra_confident"),
@@ -99,7 +99,7 @@ ROWS = (
     ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
     ("parameters: 95 % intervals that contain the true value", "label_withheld", "parameters", "inside_ci95"),
     (
-        "decrease of the gap relative to the decrease by the true effect: median",
+        "decrease of the gap, divided by the decrease that the true effect gives: median",
         "label_withheld",
         "shrink",
         "median_ratio",
@@ -123,8 +123,8 @@ def show(result: Mapping[str, Any], console: "Console") -> None:
 
 def show_positions(result: Mapping[str, Any], console: "Console") -> None:
     console.print(
-        f"{_counted(result)}; {result['answers']} answers, {result['tellable']} of them to one identifiable effect. "
-        f"Right first or confounded: {_percent(result['named_where_tellable'])}; a false cause above 0.8: "
+        f"{_counted(result)}; {result['answers']} answers, {result['tellable']} of them on one distinguishable effect. "
+        f"Right first or confounded: {_percent(result['named_where_tellable'])}; false causes above confidence 0.8: "
         f"{_percent(result['false_confident'])}; false alarms without an effect: "
         f"{_percent(result['label_withheld']['no_effect']['false_alarms'])}"
     )

@@ -19,7 +19,7 @@ def diagnose_fleet(
         Path,
         typer.Argument(
             metavar="DIR",
-            help="Folder of cases (folders with a model, train* and heldout* recordings); with --sim, of recordings.",
+            help="Folder of cases (folders with a model, train*, heldout* recordings) or, with --sim, of recordings.",
         ),
     ],
     stated: "Corrections",

@@ -79,5 +79,5 @@ def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> N
     found = place.attack(remove, guarded=True)
     assert not found.wrong, found
     assert re.search("No such device|Network is down", found.host), found.host
-    assert "guard: closed, it passes no more frames: an interface failed (" in found.guard
+    assert "guard: closed, so it passes no more frames: an interface failed (" in found.guard
     assert "the joints were commanded to stop" in found.guard

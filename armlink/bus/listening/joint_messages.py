@@ -239,7 +239,7 @@ class ListeningBus(InProcessBus):
             return
         time = self._clocks[message.source].time(message.stamp, message.arrived)
         if time is None:
-            self._remark("messages came late or twice: their time stamps are no newer than those before")
+            self._remark("messages came late or twice: their time stamps are not newer than earlier ones")
             return
         heard = {name for _, name in owned}
         readings = [frame for number, name in owned for frame in self._reading(message, number, name)]

@@ -31,7 +31,7 @@ FAMILY = Family(
     build=_late("drives", "CanopenDrives"),
     self_test=_late("check.self_test", "self_test"),
     self_test_steps="One joint after the other is then quick-stopped, and later gets no commands for {deadline:.0f} "
-    "ms; last, no joint gets the heartbeat of this host for twice as long.",
+    "ms; finally, no joint gets the heartbeat of this host for twice as long.",
     search=_late("check.scan", "scan_report"),
     discovery=Discovery(_late("check.scan", "FoundNodes"), ("moteus", "odrive")),
     examine=_late("check.scan", "arm_findings"),

@@ -38,7 +38,7 @@ class JointStateSettings(DriveSettings):
         if (self.effort == "current") != (self.torque_constant is not None):
             raise ValueError(
                 f"effort is {self.effort} and torque_constant is {self.torque_constant}: give torque_constant [N·m/A] "
-                "where the effort is a current, and only there"
+                "if, and only if, the effort is a current"
             )
         return self
 

@@ -206,7 +206,7 @@ class RecalibrationWorkflow:
         recalibrator, joint = self._active(), self._names.index(row.proposal.joint)
         current = recalibrator.record.id
         if row.proposal.base != current:
-            self._keep_failure(row, Refused(f"record {current} became current before it was written"))
+            self._keep_failure(row, Refused(f"record {current} became current before the proposed record was written"))
             return
 
         def work() -> CalibrationRecord:

@@ -56,7 +56,7 @@ class DaemonCollector(Collector):
         for kind, count in self._view.external().counts.items():
             contacts.add_metric([kind], count)
         yield contacts
-        yield GaugeMetricFamily(PREFIX + "stream_clients", "Present clients of the stream.", self._streams.clients)
+        yield GaugeMetricFamily(PREFIX + "stream_clients", "Clients on the stream now.", self._streams.clients)
         yield CounterMetricFamily(
             PREFIX + "stream_cut_off",
             "Clients of the stream that were cut off because they did not read.",

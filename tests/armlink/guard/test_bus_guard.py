@@ -336,7 +336,7 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     guard._to_wire(0x80, b"", False)
     assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
     assert lines == [
-        "guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; "
+        "guard: closed, so it passes no more frames: the program sent identifier 123h, which the policy does not name; "
         "the joints were commanded to stop; start the guard again to open it"
     ]
     guard._to_program(0x181, bytes(8), False)
@@ -589,7 +589,7 @@ def test_main_passes_frames_until_it_is_told_to_end_and_stops_the_joints(wires, 
     assert all_heard(program) == [(0x181, b"12345678", 0, 16)]
     first, second = capfd.readouterr().err.splitlines()
     assert first == f"guard: arm0 may command can0 as {tmp_path / 'policy.json'} allows"
-    assert second.startswith("guard: closed, it passes no more frames: the guard was ended by a signal; ")
+    assert second.startswith("guard: closed, so it passes no more frames: the guard was ended by a signal; ")
 
 
 def test_main_closes_once(wires, monkeypatch, tmp_path, capfd):
@@ -605,7 +605,7 @@ def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_p
     assert run_main(wires, monkeypatch, tmp_path, [*failures, None]) == 0
     assert all_heard(wires[1]) == STOP
     _, line = capfd.readouterr().err.splitlines()
-    assert line.startswith("guard: closed, it passes no more frames: an interface failed (Network is down); ")
+    assert line.startswith("guard: closed, so it passes no more frames: an interface failed (Network is down); ")
 
 
 def opened(content=CONTENT):

@@ -235,7 +235,11 @@ def test_on_another_bus_it_asks_first(capsys):
             ("quick", "heartbeat"),
         ),
         ("six-moteus", ("wrist_3: damps (moteus)",), ("quick", "heartbeat", "keeper")),
-        ("six-piper", ("wrist_3: holds (piper)", "Last, no joint gets commands", "keeper must hold"), ("heartbeat",)),
+        (
+            "six-piper",
+            ("wrist_3: holds (piper)", "Finally, no joint gets commands", "keeper must hold"),
+            ("heartbeat",),
+        ),
     ],
 )
 def test_it_announces_what_it_tests_of_these_drives(arm, says, never, capsys):

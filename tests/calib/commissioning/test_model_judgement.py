@@ -180,7 +180,7 @@ def efforts_of(model: Path) -> list[str]:
 
 def test_torques_that_the_protocol_cannot_carry_are_refused(tmp_path: Path) -> None:
     """2100h:01 is INTEGER32 in µN·m and ends at 2147 N·m."""
-    with pytest.raises(BadInput, match=r"the readings of 2100h end at 2147 N·m"):
+    with pytest.raises(BadInput, match=r"object 2100h can report at most 2147 N·m"):
         drafted(DrawnModel(3, reach=6.0).write(tmp_path))
 
 

@@ -403,7 +403,7 @@ def test_without_records_it_waits_and_begins_when_they_come(tmp_path: Path) -> N
     assert ": sweep the arm, then calibrate and identify: armlink sweep " in status.detail
     listening = FastDaemon(tmp_path / "listening", 1, settings("apply"), listen_only=True, records=False)
     listening.run(10)
-    assert "stop the program that commands the arm, sweep the arm" in listening.view.status().detail
+    assert "stop the program that commands the arm, then sweep the arm" in listening.view.status().detail
     assert daemon.view.estimates() == ()
     assert daemon.view.joints()[0].model_torque is None
     for record in daemon.good_records():

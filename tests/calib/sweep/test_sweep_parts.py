@@ -277,7 +277,9 @@ def test_people_are_told_of_readings_without_the_words_of_the_file() -> None:
     data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
     stalls = [StallLine(t=1.0, late_ms=None, reading=each, reason="") for each in ("scout 6", "j2.1 3", "end")]
     (line,) = stall_lines(replace(data, stalls=tuple(stalls)))
-    assert line.endswith("stopped 3 times, and this was repeated: rough gravity model, pose 6; j2.1, reading 3; end")
+    assert line.endswith(
+        "stopped 3 times; these readings were repeated: rough gravity model, pose 6; j2.1, reading 3; end"
+    )
 
 
 def test_without_a_terminal_it_is_said_what_moves_and_that_nobody_is_asked(
@@ -285,7 +287,7 @@ def test_without_a_terminal_it_is_said_what_moves_and_that_nobody_is_asked(
 ) -> None:
     monkeypatch.setattr("sys.stdin", None)
     (said,) = confirm("bench will move", "Is its space clear?")
-    assert said == "bench will move. Is its space clear? Without a terminal nobody is asked, and it moves now"
+    assert said == "bench will move. Is its space clear? Without a terminal nobody is asked, and the arm moves now"
 
 
 def swept(folder: Path, mass: float, seconds: int, speed: float | None = None) -> SweepData:

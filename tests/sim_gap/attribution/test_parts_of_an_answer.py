@@ -42,7 +42,7 @@ def test_a_remaining_gap_is_noted_with_its_regime_where_one_is_clear(monkeypatch
     monkeypatch.setattr(notes, "locate", lambda data, left, above: found[: len(above)])
     said = notes._remaining(SimpleNamespace(margin={("tau", 0): 0.1, ("tau", 1): 0.1}), {})
     assert said[0].endswith("correlated with velocity (60%)")
-    assert said[1].endswith("without a known regime")
+    assert said[1].endswith("in no clear regime of motion")
     assert notes._remaining(SimpleNamespace(margin={("tau", 0): 0.9, ("tau", 1): 0.9}), {}) == ()
 
 

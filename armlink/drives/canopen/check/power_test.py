@@ -114,7 +114,7 @@ class PowerTest:
         if tested is not None:
             for joint, code, _ in self.drives.known.emergencies:
                 if joint != tested:
-                    raise BusFault(f"{names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}, while it only held")
+                    raise BusFault(f"{names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}, while it held still")
         return sample
 
     def _without_torque(self) -> None:

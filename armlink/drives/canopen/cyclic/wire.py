@@ -52,8 +52,8 @@ def check_fits(row: LinkJoint, limits: Limits, unit: Units) -> None:
     if row.settings.torque == "record" and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
         most = INT32_MAX * TORQUE_PER_MICRO
         raise BadInput(
-            f"{name}: max_torque is {limits.max_torque} N·m, but the readings of 2100h end at {most:.4g} "
-            "N·m: lower max_torque, or take a drive with larger torque readings"
+            f"{name}: max_torque is {limits.max_torque} N·m, but object 2100h can report at most "
+            f"{most:.4g} N·m: lower max_torque, or take a drive that reports larger torques"
         )
     for key, value, of, scale, most, place in (
         ("max_torque", limits.max_torque, "N·m", unit.torque, INT16_MAX, "6071h"),

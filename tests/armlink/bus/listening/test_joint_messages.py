@@ -131,7 +131,7 @@ def test_late_and_repeated_messages_are_left_out_and_said(caplog):
     ]
     found, bus = samples_of([*order, message(3), message(4)])
     np.testing.assert_allclose([each.position[0] for each in found], [0.1, 0.3, 0.1])
-    assert bus.said() == ["messages came late or twice: their time stamps are no newer than those before (2 times)"]
+    assert bus.said() == ["messages came late or twice: their time stamps are not newer than earlier ones (2 times)"]
     assert len([each for each in caplog.records if "late or twice" in each.message]) == 1
 
 
@@ -212,7 +212,7 @@ def test_why_nothing_is_heard():
     assert "left_wheel, right_wheel, and none of a, b" in bus.silence()
     assert "joint: NAME" in bus.silence()
     _, bus = samples_of([message(k, stamp=7.0) for k in range(3)], described)
-    assert "no newer" in bus.silence()
+    assert "not newer than earlier ones" in bus.silence()
 
 
 def test_monitor_and_recorder_hear_the_same():
