@@ -81,13 +81,11 @@ def external(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
-    from calib.external.arm_model import listener_of
-    from calib.external.even_samples import SHORTEST
+    from calib.external.arm_model import SHORTEST, listener_of
     from calib.external.force_map import draw_map, smallest_forces
-    from calib.external.learned import Learned, load_learned, save_learned
-    from calib.external.listening import listen
+    from calib.external.listening import Learned, listen, load_learned, save_learned
     from calib.external.tables import answer_of, require_writable, save_heard
-    from calib.fit.pose_readings import in_joint_order
+    from calib.fit.recorded_rows import in_joint_order
 
     source = stated_bus(bus, ros2, lerobot)
     listens = not recordings and picture is None and (source is not None or not (learned and baseline))
@@ -212,7 +210,7 @@ def parse_frame(text: str | None, records: "ArmRecords") -> "WrenchFrame":
 
 
 def _records(arm: str, base: str | None, tip: str | None, tool: str | None, store: str | None) -> "ArmRecords":
-    from calib.arm.stated_model import stated_model
+    from calib.arm.kinematics import stated_model
     from calib.external.arm_model import ArmRecords
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore

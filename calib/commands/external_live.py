@@ -16,7 +16,7 @@ from armlink.commands.output import json_lines
 from armlink.commands.plain_console import PlainConsole, results
 from armlink.errors import BusFault
 from calib.commands.heard_samples import WAIT_SECONDS, heard_samples
-from calib.external.live import ExternalRow, LiveExternal
+from calib.external.listening import ExternalRow, LiveExternal
 from calib.external.tables import AXES, event_of, event_text, wrench_of
 from gcomp.external.external_model import NORMAL_95
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.link.listener import Listener
     from armlink.link.types import Sample
-    from calib.external.learned import Learned
+    from calib.external.listening import Learned
     from gcomp.arrays import Array
 
     Heard = tuple[float, Array, Array, Array, Array]

@@ -15,7 +15,7 @@ from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.findings import FoundDrive, FoundDrives, SetupFinding
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.draft import GUESSES, LEAST_TORQUE
-from calib.commissioning.motion_checks import LEAST_DAMPING
+from calib.commissioning.model_checks import LEAST_DAMPING
 
 LEAST_TURN = 0.1
 """A joint counts as turned by hand from here on [rad]; a choice, far above the play of a gear."""

@@ -27,7 +27,7 @@ from calib.commissioning.drive_match import (
     match_in_order,
     with_gains,
 )
-from calib.commissioning.motion_checks import largest_inertias
+from calib.commissioning.model_checks import largest_inertias
 
 PLACES = ("node", "id", "reply", "direction", "zero")
 """Keys of a drive that come with the bus; the others are the arm file's own."""

@@ -9,7 +9,7 @@ import numpy as np
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from armlink.extras import require_extra
-from calib.external.even_samples import LONGEST_GAP
+from calib.external.arm_model import LONGEST_GAP
 from calib.external.listening import Heard
 from gcomp.arrays import Array
 from gcomp.external.contact import ContactEvent

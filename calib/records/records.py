@@ -24,8 +24,7 @@ from armlink.content.yaml_text import yaml_document
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.tool import tool_covariance, tool_moments
+from calib.arm.kinematics import gcomp_arm, tool_covariance, tool_moments
 from gcomp.arrays import Array
 
 Matrix = tuple[tuple[FiniteFloat, ...], ...]

@@ -1,11 +1,13 @@
 """Verification: model against sensor torque at held-out poses, as Figure 6 of [MH97] (docs/theory.md, section 3).
 
 A torque sensor is read at rest. Of a drive whose torque is a motor current, the half sum of two short creeps, there and
-back, is read, which is without friction.
+back, is read, which is without friction. Poses that the drives do not reach are left out.
+
+A payload is weighed in the same way: it is what the torques show beyond the gravity record.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,18 +20,18 @@ from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_motion, sweep_section
+from calib.fit.field_fit import Payload, raw_readings, weigh_payload
 from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.creep_plan import CreepingArm
-from calib.plan.planned_arm import PlannedArm, nearest_first
+from calib.plan.planned_arm import FASTEST, PlannedArm, nearest_first
+from calib.plan.sweep_options import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-ACCELERATION = 2.0
-"""Of travel between poses [rad/s²]; a choice."""
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
 tests/calib/drawn_arms.py allows."""
@@ -48,6 +50,8 @@ CREEP_TOLERANCE = 0.02
 """TOLERANCE of creeps."""
 CREEP_FLOOR = 0.008
 """NOISE_FLOOR of creeps: friction that differs between the directions."""
+FEWEST_WEIGHED = 2
+"""Poses without which the mass of a payload and its place cannot be told apart (docs/theory.md, section 6.4)."""
 ReadAt = Callable[[Mover, Array], tuple[Array, Array] | None]
 """Position [rad] and torque [N·m] readings (n,) at a pose (n,); back again, and None, where a joint stalls."""
 
@@ -183,10 +187,10 @@ def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array,
 def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
     begin = mover.position.copy()
     try:
-        mover.travel(pose, ACCELERATION)
+        mover.travel(pose, FASTEST)
     except Stalled:
         mover.hold_all()
-        mover.travel(begin, ACCELERATION)
+        mover.travel(begin, FASTEST)
         return None
     rest = mover.rest(np.ones(mover.link.n, dtype=bool))
     return rest.position, rest.torque
@@ -251,3 +255,40 @@ def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> Array:
         means.append(line)
     half_sum: Array = (means[0] + means[1]) / 2
     return half_sum
+
+
+def run_weigh(
+    link: ArmDriver,
+    arm_file: ArmFile,
+    gravity: GravityRecord,
+    calibration: CalibrationRecord,
+    *,
+    poses: int = 12,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    on_stall: OnStall = give_up,
+) -> tuple[Payload, int]:
+    """(The payload, number of poses that were reached). The link must have been enabled.
+
+    Raises Refused where a record is of another arm or too few poses are reached, BadInput, BusFault.
+    """
+    creeping = sweep_motion(arm_file) == "creep"
+    found = run_verify(
+        link,
+        arm_file,
+        gravity,
+        calibration,
+        poses=poses,
+        seed=seed,
+        at=None if creeping else partial(weighing_poses, arm_file, poses, seed),
+        progress=progress,
+        on_stall=on_stall,
+    )
+    reached = len(found.sensor)
+    if reached < FEWEST_WEIGHED:
+        raise Refused(f"{reached} of {poses} poses were reached: can the drives hold the load?")
+    sigma = sweep_section(arm_file).standard_error * arm_file.require_link().rated_torques
+    readings = raw_readings(found.position, found.sensor, np.maximum(sigma, 1e-9), calibration)
+    if creeping:  # half sums of both directions
+        readings = replace(readings, direction=np.zeros_like(readings.direction))
+    return weigh_payload(arm_file, readings, gravity, calibration), reached

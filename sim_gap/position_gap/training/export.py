@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armlink.recording.recording import Recording
-from calib.arm.urdf import xml_comment
+from calib.arm.model_files import xml_comment
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import write_changes
 from sim_gap.better_model.export import CorrectedText
