@@ -126,8 +126,7 @@ def tool_moments(arm: Arm, tool: Tool | None) -> Array:
     if tool is None:
         return np.zeros(2 * arm.n)
     at_origin, by_point = payload_columns(arm)
-    moments: Array = tool.mass * (at_origin + by_point @ np.array(tool.centre))
-    return moments
+    return np.asarray(tool.mass * (at_origin + by_point @ np.array(tool.centre)))
 
 
 def tool_covariance(arm: Arm, tool: Tool | None) -> Array:
@@ -137,8 +136,7 @@ def tool_covariance(arm: Arm, tool: Tool | None) -> Array:
     at_origin, by_point = payload_columns(arm)
     of_mass = tool.mass_std * (at_origin + by_point @ np.array(tool.centre))
     of_centre = tool.mass * tool.centre_std * by_point
-    covariance: Array = np.outer(of_mass, of_mass) + of_centre @ of_centre.T
-    return covariance
+    return np.outer(of_mass, of_mass) + of_centre @ of_centre.T
 
 
 def parse_tool(text: str) -> Tool | None:

@@ -82,9 +82,8 @@ def external(
     from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
     from calib.external.arm_model import SHORTEST, listener_of
-    from calib.external.force_map import draw_map, smallest_forces
     from calib.external.listening import Learned, listen, load_learned, save_learned
-    from calib.external.tables import answer_of, require_writable, save_heard
+    from calib.external.tables import answer_of, draw_map, require_writable, save_heard, smallest_forces
     from calib.fit.recorded_rows import in_joint_order
 
     source = stated_bus(bus, ros2, lerobot)
@@ -156,18 +155,8 @@ def external(
     if out is not None:
         save_heard(out, every, names)
         console.print(f"{out} is written")
-    write_json(
-        json_file,
-        {
-            "schema": "armlink.external/1",
-            "joints": list(names),
-            "channel": listener.channel,
-            "baseline_s": listener.model.seconds,
-            "false_alarms_per_hour": per_hour,
-            "frame": {"joint": names[place.link], "point": place.point.tolist()},
-            "recordings": answers,
-        },
-    )
+    described = Learned(listener, place, per_hour).described()
+    write_json(json_file, {"schema": "armlink.external/1", **described, "recordings": answers})
 
 
 def parse_rate(text: str) -> float:

@@ -94,6 +94,17 @@ class Learned:
     per_hour: float
     """Allowed rate of false alarms [1/h]."""
 
+    def described(self) -> dict[str, Any]:
+        """Its part of every answer."""
+        model, frame = self.listener.model, self.frame
+        return {
+            "joints": list(model.arm.names),
+            "channel": self.listener.channel,
+            "baseline_s": model.seconds,
+            "false_alarms_per_hour": self.per_hour,
+            "frame": {"joint": model.arm.names[frame.link], "point": frame.point.tolist()},
+        }
+
 
 def save_learned(path: Path, learned: Learned) -> None:
     """Write it; raises OSError."""

@@ -25,7 +25,7 @@ from calib.fit.calibration import (
 )
 from calib.fit.creep_fit import SEEN
 from calib.fit.creep_residuals import inflation
-from calib.fit.heldout import held_out
+from calib.fit.gravity_fit import held_out
 from calib.fit.recorded_rows import directions
 from calib.fit.small_troubles import PositionField
 from calib.fit.sweep_readings import FEWEST

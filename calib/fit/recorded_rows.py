@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -35,28 +35,12 @@ FEWEST_ROWS = 12
 """Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
 
 
-@dataclass(frozen=True, eq=False)
-class WindowAverages:
-    """Of W windows of a recording; all (W, n) but `slow`."""
+def windows_of(t: Array, position: Array, torque: Array, source: str) -> tuple[StaticReadings, Array, Mask]:
+    """(Averages over windows, accelerations (W, n) [rad/s²], which windows have all joints slow and steady (W,)).
 
-    position: Array
-    """[rad]"""
-    velocity: Array
-    """[rad/s]"""
-    acceleration: Array
-    """[rad/s²]"""
-    torque: Array
-    """[N·m]"""
-    sigma: Array
-    """Standard deviation of the torque, by its scatter about a straight line [N·m]."""
-    direction: Array
-    """Sign of each joint's last motion."""
-    slow: Mask
-    """Windows in which all joints move slowly and steadily (W,)."""
-
-
-def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowAverages:
-    """Averages over windows of times (K,) [s] with positions and torques (K, n); raises BadInput if there is none."""
+    Of times (K,) [s] with positions and torques (K, n); sigma is that of a mean, by the scatter of its torques about a
+    straight line. Raises BadInput if there is no window.
+    """
     windows = _windows(t)
     if not windows:
         raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
@@ -66,15 +50,16 @@ def windows_of(t: Array, position: Array, torque: Array, source: str) -> WindowA
     padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, position.shape[1]))
     steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
     means = np.array([position[each].mean(axis=0) for each in windows])
-    return WindowAverages(
-        position=means,
-        velocity=slopes,
-        acceleration=np.array([2 * np.polyfit(t[each] - t[each].mean(), position[each], 2)[0] for each in windows]),
-        torque=np.array([torque[each].mean(axis=0) for each in windows]),
-        sigma=np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in windows]),
+    sigma = np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in windows])
+    found = StaticReadings(
+        means,
+        np.array([torque[each].mean(axis=0) for each in windows]),
+        np.maximum(sigma, np.finfo(float).tiny),
         direction=directions(means),
-        slow=(np.abs(slopes).max(axis=1) <= SLOW) & steady,
+        velocity=slopes,
     )
+    acceleration = np.array([2 * np.polyfit(t[each] - t[each].mean(), position[each], 2)[0] for each in windows])
+    return found, acceleration, (np.abs(slopes).max(axis=1) <= SLOW) & steady
 
 
 def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:
@@ -89,21 +74,15 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
             "torque sensors"
         )
     keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
-    windows = windows_of(recording.t[keep], recording.position[keep], held.apply(recording.torque[keep]), source)
-    slow = windows.slow
+    sent = held.apply(recording.torque[keep])
+    windows, _, slow = windows_of(recording.t[keep], recording.position[keep], sent, source)
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
             f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are "
             f"needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} rad/s"
         )
     typical = np.sqrt(np.median(windows.sigma[slow] ** 2, axis=0))
-    return StaticReadings(
-        windows.position[slow],
-        windows.torque[slow],
-        np.maximum(typical, 1e-6),
-        direction=windows.direction[slow],
-        series=np.full(slow.sum(), number),
-    )
+    return replace(windows.rows(slow), sigma=np.maximum(typical, 1e-6), series=np.full(slow.sum(), number))
 
 
 def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
@@ -133,8 +112,7 @@ def _windows(t: Array) -> list[slice]:
 def _scatter(t: Array, values: Array) -> Array:
     """Standard deviation (n,) about a straight line."""
     line = np.outer(t - t.mean(), slope(t, values)) + values.mean(axis=0)
-    scatter: Array = np.sqrt(((values - line) ** 2).sum(axis=0) / max(len(t) - 2, 1))
-    return scatter
+    return np.asarray(np.sqrt(((values - line) ** 2).sum(axis=0) / max(len(t) - 2, 1)))
 
 
 def directions(positions: Array) -> Array:
@@ -197,19 +175,13 @@ def pose_readings(
         found = found.rows(slow)
     else:
         whole = np.isfinite(torque).all(axis=1)
-        windows = windows_of(t[whole], position[whole], torque[whole], source)
-        inertia = np.zeros_like(windows.torque)
-        counted = windows.slow
+        found, acceleration, counted = windows_of(t[whole], position[whole], torque[whole], source)
+        inertia = np.zeros_like(found.torque)
         if model.placed is not None and model.placed.arm.beta.any():
-            inertia = inertial_torque(model.placed, windows.position, windows.velocity, windows.acceleration)
+            inertia = inertial_torque(model.placed, found.position, found.velocity, acceleration)
             counted = np.ones(len(inertia), dtype=bool)
-        found = StaticReadings(
-            windows.position,
-            windows.torque - inertia,
-            np.hypot(INERTIA_DOUBT * inertia, EXACT),
-            direction=windows.direction,
-            velocity=windows.velocity,
-        ).rows(counted)
+        sigma = np.hypot(INERTIA_DOUBT * inertia, EXACT)
+        found = replace(found, torque=found.torque - inertia, sigma=sigma).rows(counted)
     count = len(found)
     return replace(found, load=np.full(count, load), series=np.full(count, number, dtype=np.int64))
 

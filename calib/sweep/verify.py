@@ -24,9 +24,9 @@ from calib.fit.field_fit import Payload, raw_readings, weigh_payload
 from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
-from calib.plan.creep_plan import CreepingArm
+from calib.plan.creep_plan import TRAVEL_ACCELERATION, CreepingArm
 from calib.plan.planned_arm import FASTEST, PlannedArm, nearest_first
-from calib.plan.sweep_options import weighing_poses
+from calib.plan.sweep_plan import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
@@ -52,8 +52,6 @@ CREEP_FLOOR = 0.008
 """NOISE_FLOOR of creeps: friction that differs between the directions."""
 FEWEST_WEIGHED = 2
 """Poses without which the mass of a payload and its place cannot be told apart (docs/theory.md, section 6.4)."""
-ReadAt = Callable[[Mover, Array], tuple[Array, Array] | None]
-"""Position [rad] and torque [N·m] readings (n,) at a pose (n,); back again, and None, where a joint stalls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +75,12 @@ class Verification:
     @property
     def rms(self) -> Array:
         """RMS of sensor minus model (n,) [N·m]."""
-        rms: Array = np.sqrt(np.mean((self.sensor - self.model) ** 2, axis=0))
-        return rms
+        return np.asarray(np.sqrt(np.mean((self.sensor - self.model) ** 2, axis=0)))
 
     @property
     def max_error(self) -> Array:
         """Largest absolute difference (n,) [N·m]."""
-        largest: Array = np.abs(self.sensor - self.model).max(axis=0)
-        return largest
+        return np.asarray(np.abs(self.sensor - self.model).max(axis=0))
 
     @property
     def passed(self) -> bool:
@@ -123,7 +119,6 @@ def run_verify(
     beta = np.array(gravity.beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
-    read_at: ReadAt = _half_sum_at if creeping else _rest_at
     if at is None and creeping:
         at = partial(_creep_poses, CreepingArm(arm_file), poses, seed)
     elif at is None:
@@ -132,7 +127,7 @@ def run_verify(
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
-        found = repeat_work(link, on_stall, partial(read_at, mover, pose), mover.resume)
+        found = repeat_work(link, on_stall, partial(_read_at, mover, pose, creeping), mover.resume)
         if found is None:
             continue
         position, torque = found
@@ -180,18 +175,25 @@ def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array,
     gain, offset = calibration.values("gain", 1.0), np.nan_to_num(calibration.std("offset"))
     of_gain = np.nan_to_num(calibration.std("gain")) * np.abs(model)
     square = (level + 2 * level_std) ** 2 + (variance + (of_gain**2 + offset**2) / gain**2).mean(axis=0)
-    passes: Array = np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
-    return passes
+    return np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
 
 
-def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
-    begin = mover.position.copy()
+def _read_at(mover: Mover, pose: Array, creeping: bool) -> tuple[Array, Array] | None:
+    """Position [rad] and torque [N·m] readings (n,) at a pose (n,), at rest or by creeps of all joints together, up and
+    down about the pose; back again, and None, where a joint stalls."""
+    begin, up, down = mover.position.copy(), list[Sample](), list[Sample]()
     try:
-        mover.travel(pose, FASTEST)
+        if creeping:
+            mover.travel(pose - CREEP_WAY / 2, TRAVEL_ACCELERATION)
+            up, down = _creep(mover, CREEP_WAY), _creep(mover, -CREEP_WAY)
+        else:
+            mover.travel(pose, FASTEST)
     except Stalled:
         mover.hold_all()
-        mover.travel(begin, FASTEST)
+        mover.travel(begin, 1.0 if creeping else FASTEST)
         return None
+    if creeping:
+        return pose, _half_sum(up, down, pose)
     rest = mover.rest(np.ones(mover.link.n, dtype=bool))
     return rest.position, rest.torque
 
@@ -218,19 +220,6 @@ def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> 
     return np.array(found)
 
 
-def _half_sum_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
-    """By creeps of all joints together, up and down about the pose."""
-    begin = mover.position.copy()
-    try:
-        mover.travel(pose - CREEP_WAY / 2, 1.5)
-        up, down = _creep(mover, CREEP_WAY), _creep(mover, -CREEP_WAY)
-    except Stalled:
-        mover.hold_all()
-        mover.travel(begin, 1.0)
-        return None
-    return pose, _half_sum(up, down, pose)
-
-
 def _creep(mover: Mover, way: float) -> list[Sample]:
     """All joints together by `way` [rad]."""
     period, start = mover.link.period, mover.command.position.copy()
@@ -253,8 +242,7 @@ def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> Array:
                 raise Refused(f"joint {joint + 1}: there are too few samples in a creep of {CREEP_WAY} rad")
             line[joint] = np.polynomial.polynomial.polyfit(q[kept] - at, v[kept], 1)[0]
         means.append(line)
-    half_sum: Array = (means[0] + means[1]) / 2
-    return half_sum
+    return (means[0] + means[1]) / 2
 
 
 def run_weigh(

@@ -13,7 +13,7 @@ from calib.arm.sweep_section import sweep_section
 from calib.fit.field_fit import Payload, raw_readings, weigh_payload
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
-from calib.plan.sweep_options import weighing_poses
+from calib.plan.sweep_plan import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.verify import FEWEST_WEIGHED
 from sim_bus.sim_section import with_realism
