@@ -14,13 +14,9 @@ import time
 import numpy as np
 
 from armlink.arm_file import load_arm
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.stated_model import StatedModel
-from calib.external.arm_model import ArmListener, ArmRecords
-from calib.external.learned import Learned
-from calib.external.listening import WrenchFrame
-from calib.external.live import LiveExternal
-from calib.external.sound_arm import MOTOR, prior_of_model
+from calib.arm.kinematics import StatedModel, gcomp_arm
+from calib.external.arm_model import MOTOR, ArmListener, ArmRecords, prior_of_model
+from calib.external.listening import Learned, LiveExternal, WrenchFrame
 from gcomp.external.external_model import ROWS_RATE, from_records, stride_of
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.sim_section import sim_section

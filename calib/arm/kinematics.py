@@ -1,15 +1,16 @@
-"""The arm file's kinematics as gcomp's arm, whether given as Denavit-Hartenberg rows or as a model file."""
+"""The arm file as what gcomp computes with: kinematics from rows or a model file, tool, and limits of the drives."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import MODEL_SUFFIXES, ArmFile, Tool, load_arm
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
-from calib.arm.tool import tool_moments
 from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.load import ModelArm, PlacedChain, place_chain
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 
@@ -118,3 +119,79 @@ class DriveLimits:
             np.array([joint.max_torque for joint in link.joints]),
             np.array([joint.max_velocity for joint in link.joints]),
         )
+
+
+def tool_moments(arm: Arm, tool: Tool | None) -> Array:
+    """Mass moments that the tool adds (2n,) [kg·m]; equation (P) of docs/theory.md."""
+    if tool is None:
+        return np.zeros(2 * arm.n)
+    at_origin, by_point = payload_columns(arm)
+    return np.asarray(tool.mass * (at_origin + by_point @ np.array(tool.centre)))
+
+
+def tool_covariance(arm: Arm, tool: Tool | None) -> Array:
+    """Covariance of the mass moments that the tool adds (2n, 2n) [kg²·m²]."""
+    if tool is None:
+        return np.zeros((2 * arm.n, 2 * arm.n))
+    at_origin, by_point = payload_columns(arm)
+    of_mass = tool.mass_std * (at_origin + by_point @ np.array(tool.centre))
+    of_centre = tool.mass * tool.centre_std * by_point
+    return np.outer(of_mass, of_mass) + of_centre @ of_centre.T
+
+
+def parse_tool(text: str) -> Tool | None:
+    """`MASS,X,Y,Z` [kg, m], or `0` for none; raises BadInput."""
+    try:
+        mass, *centre = (float(part) for part in text.split(","))
+    except ValueError:
+        mass, centre = np.nan, []
+    if mass == 0 and len(centre) in (0, 3):
+        return None
+    if not 0 < mass < np.inf or len(centre) != 3 or not np.isfinite(centre).all():
+        raise BadInput(
+            f"--tool {text}: expected MASS,X,Y,Z: mass [kg] and centre of mass [m] in the frame that turns with the "
+            "last joint, or 0 for no tool"
+        )
+    return Tool(mass=mass, centre=(centre[0], centre[1], centre[2]))
+
+
+def with_tool(arm_file: ArmFile, text: str | None) -> ArmFile:
+    """The arm with the tool of an option `--tool`; without one as the file has it. Raises BadInput."""
+    return arm_file if text is None else arm_file.model_copy(update={"tool": parse_tool(text)})
+
+
+@dataclass(frozen=True, eq=False)
+class StatedModel:
+    """An arm, and the model file and the arm file behind it."""
+
+    arm: Arm
+    placed: PlacedChain | None
+    """The chain in its model file; None for an arm of Denavit-Hartenberg rows."""
+    path: Path | None
+    """The model file."""
+    beta: Array | None
+    """Mass moments of the model file and the tool (2n,) [kg·m]; None without one."""
+    arm_file: ArmFile | None = None
+
+
+def stated_model(model: str, base: str | None = None, tip: str | None = None, tool: str | None = None) -> StatedModel:
+    """Of a bundled arm, an arm file, or a URDF or MJCF file with the ends of its chain; raises BadInput, BadModel.
+
+    `tool` is that of an option `--tool`; without one it is the arm file's.
+    """
+    path = Path(model)
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        if not path.is_file():
+            raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file, or of an arm file")
+        with model_budget(path):
+            placed = place_chain(path, base=base, tip=tip)
+        moments = tool_moments(placed.arm.arm, None if tool is None else parse_tool(tool))
+        return StatedModel(placed.arm.arm, placed, path, placed.arm.beta + moments)
+    if base is not None or tip is not None:
+        raise BadInput("--base, --tip: only for a URDF or MJCF file; an arm file describes its chain under kinematics")
+    arm_file = with_tool(load_arm(model), tool)
+    if arm_file.model_path is None:
+        return StatedModel(gcomp_arm(arm_file), None, None, None, arm_file)
+    placed = model_chain(arm_file)
+    found = model_arm(arm_file, placed)
+    return StatedModel(found.arm, placed, arm_file.model_path, found.beta, arm_file)

@@ -54,7 +54,7 @@ def calibrate(
     from calib.api import calibrated
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep, drives_of
-    from calib.fit.heldout import held_out_steps
+    from calib.fit.gravity_fit import held_out_steps
     from calib.fit.sensor_fit import SensorFit, mass_complaint
     from calib.install.apply import Apply, apply_creep, apply_record
     from calib.install.plausibility import replaced_record

@@ -81,13 +81,10 @@ def external(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
-    from calib.external.arm_model import listener_of
-    from calib.external.even_samples import SHORTEST
-    from calib.external.force_map import draw_map, smallest_forces
-    from calib.external.learned import Learned, load_learned, save_learned
-    from calib.external.listening import listen
-    from calib.external.tables import answer_of, require_writable, save_heard
-    from calib.fit.pose_readings import in_joint_order
+    from calib.external.arm_model import SHORTEST, listener_of
+    from calib.external.listening import Learned, listen, load_learned, save_learned
+    from calib.external.tables import answer_of, draw_map, require_writable, save_heard, smallest_forces
+    from calib.fit.recorded_rows import in_joint_order
 
     source = stated_bus(bus, ros2, lerobot)
     listens = not recordings and picture is None and (source is not None or not (learned and baseline))
@@ -158,18 +155,8 @@ def external(
     if out is not None:
         save_heard(out, every, names)
         console.print(f"{out} is written")
-    write_json(
-        json_file,
-        {
-            "schema": "armlink.external/1",
-            "joints": list(names),
-            "channel": listener.channel,
-            "baseline_s": listener.model.seconds,
-            "false_alarms_per_hour": per_hour,
-            "frame": {"joint": names[place.link], "point": place.point.tolist()},
-            "recordings": answers,
-        },
-    )
+    described = Learned(listener, place, per_hour).described()
+    write_json(json_file, {"schema": "armlink.external/1", **described, "recordings": answers})
 
 
 def parse_rate(text: str) -> float:
@@ -212,7 +199,7 @@ def parse_frame(text: str | None, records: "ArmRecords") -> "WrenchFrame":
 
 
 def _records(arm: str, base: str | None, tip: str | None, tool: str | None, store: str | None) -> "ArmRecords":
-    from calib.arm.stated_model import stated_model
+    from calib.arm.kinematics import stated_model
     from calib.external.arm_model import ArmRecords
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore

@@ -16,7 +16,7 @@ from armlink.commands.output import json_lines
 from armlink.commands.plain_console import PlainConsole, results
 from armlink.errors import BusFault
 from calib.commands.heard_samples import WAIT_SECONDS, heard_samples
-from calib.external.live import ExternalRow, LiveExternal
+from calib.external.listening import ExternalRow, LiveExternal
 from calib.external.tables import AXES, event_of, event_text, wrench_of
 from gcomp.external.external_model import NORMAL_95
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.link.listener import Listener
     from armlink.link.types import Sample
-    from calib.external.learned import Learned
+    from calib.external.listening import Learned
     from gcomp.arrays import Array
 
     Heard = tuple[float, Array, Array, Array, Array]
@@ -45,7 +45,7 @@ def follow(
         _shown(out) as show,
         contextlib.suppress(KeyboardInterrupt),
     ):
-        write(_header(live))
+        write({"schema": "armlink.external-live/1", **learned.described()})
         rows, heard, first, shown, newest = 0, 0, 0.0, -np.inf, None
         for samples in heard_samples(arm, source, seconds, _channels(learned.listener.channel)):
             if samples:
@@ -79,19 +79,6 @@ def _channels(channel: str) -> Any:
         return sample.t, sample.position, sample.velocity, torque, listener.temperatures
 
     return channels
-
-
-def _header(live: LiveExternal) -> dict[str, Any]:
-    listener, frame = live.learned.listener, live.learned.frame
-    names = listener.model.arm.names
-    return {
-        "schema": "armlink.external-live/1",
-        "joints": list(names),
-        "channel": listener.channel,
-        "baseline_s": listener.model.seconds,
-        "false_alarms_per_hour": live.learned.per_hour,
-        "frame": {"joint": names[frame.link], "point": frame.point.tolist()},
-    }
 
 
 def _line(live: LiveExternal, row: ExternalRow, first: float) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def hold_afloat(
     from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
-    from calib.arm.tool import with_tool
+    from calib.arm.kinematics import with_tool
     from calib.commands.screen import confirm, print_lines, warn_late
     from calib.floating.run import run_float
 

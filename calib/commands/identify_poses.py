@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from armlink.errors import BadInput
-from calib.arm.stated_model import StatedModel, stated_model
+from calib.arm.kinematics import StatedModel, stated_model
 from calib.fit.calibration import rms
 from calib.fit.pose_fit import SENSOR_GAIN_STD, PoseFit, fit_poses
-from calib.fit.pose_readings import load_poses
+from calib.fit.recorded_rows import load_poses
 from gcomp.arrays import Array, Mask
 from gcomp.identify.motor_model import MotorDoubt
 

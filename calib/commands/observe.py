@@ -90,7 +90,7 @@ def recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]
     """Rows of a recording: time [s], positions and torques, in the order of the arm's joints. Raises BadInput."""
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording
-    from calib.fit.pose_readings import in_joint_order
+    from calib.fit.recorded_rows import in_joint_order
 
     run = in_joint_order(load_recording(path), arm.joint_names, str(path))
     torque = run.torque if run.torque is not None else run.motor_torque

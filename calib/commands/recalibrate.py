@@ -49,7 +49,7 @@ def recalibrate(
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
-    from calib.arm.tool import with_tool
+    from calib.arm.kinematics import with_tool
     from calib.fit.field_fit import fit_field
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
@@ -102,7 +102,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.dataset import labels, load_data
-    from calib.fit.slow_windows import rows_of_recording, rows_of_sweeps
+    from calib.fit.recorded_rows import rows_of_recording, rows_of_sweeps
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)

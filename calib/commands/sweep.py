@@ -11,8 +11,6 @@ from calib.commands.options import JsonFile, KeepGoing, WithoutAsking
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.commands.plain_console import PlainConsole
-    from armlink.loop.driver import ArmDriver
-    from calib.commands.screen import SweepScreen
     from calib.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
@@ -65,6 +63,8 @@ def sweep(
 
     Example: armlink sweep sarcos --bus socketcan:vcan0 --out unloaded
     """
+    from functools import partial
+
     from armlink.arm_file import SIMULATED, load_arm
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
@@ -72,10 +72,13 @@ def sweep(
     from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.api import open_link
-    from calib.arm.sweep_section import with_hold
+    from calib.arm.sweep_section import sweep_motion, with_hold
     from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines, warn_late
     from calib.commissioning.model_checks import refuse_impossible_sweep
     from calib.dataset import MANIFEST, new_folder, require_vacant
+    from calib.sweep.preflight import find_stops, listen
+    from calib.sweep.run import run_sweep
+    from calib.sweep.sweep_pass import repeat_work
 
     if picture is not None:
         require_extra("--picture", "reports")
@@ -115,17 +118,22 @@ def sweep(
         print_lines(unasked)
         work.enabled = True
         with SweepScreen(f"{arm_file.name}, {_load(reference_mass)}") as screen:
-            found, data = _run(
+            link.enable()
+            on_stall = screen.on_stall(keep_going)
+            found = heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
+            if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
+                pushed = partial(screen.count, what="stops, each touched by its joint")
+                found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
+            data = run_sweep(
                 link,
                 arm_file,
                 out,
-                screen,
-                keep_going,
-                reference_mass,
-                resume,
-                seed,
-                check_stops and not resume and not reference_mass,
-                of_link,
+                reference_mass=reference_mass,
+                resume=resume,
+                progress=screen.update,
+                seed=seed,
+                on_stall=on_stall,
+                bus=of_link,
             )
         lateness = link.stats.lateness
     _show(arm_file, found, data, results(json_file), _again(arm, bus, hold, dry_run))
@@ -172,46 +180,6 @@ def _load(reference_mass: float) -> str:
 
 def _minutes(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
-
-
-def _run(
-    link: "ArmDriver",
-    arm_file: "ArmFile",
-    out: Path,
-    screen: "SweepScreen",
-    keep_going: int,
-    reference_mass: float,
-    resume: bool,
-    seed: int,
-    check_stops: bool,
-    bus: str | None,
-) -> "tuple[Preflight, SweepData]":
-    from calib.arm.sweep_section import sweep_motion
-    from calib.sweep.preflight import find_stops, listen
-    from calib.sweep.run import run_sweep
-    from calib.sweep.sweep_pass import repeat_work
-
-    def pushed(done: int, total: int) -> None:
-        screen.count(done, total, "stops, each touched by its joint")
-
-    link.enable()
-    on_stall = screen.on_stall(keep_going)
-    heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
-    found = heard
-    if check_stops and sweep_motion(arm_file) == "steps":
-        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
-    data = run_sweep(
-        link,
-        arm_file,
-        out,
-        reference_mass=reference_mass,
-        resume=resume,
-        progress=screen.update,
-        seed=seed,
-        on_stall=on_stall,
-        bus=bus,
-    )
-    return found, data
 
 
 def _again(arm: str, bus: str | None, hold: str | None, dry_run: bool) -> list[str]:

@@ -57,7 +57,7 @@ def _model(
 ) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     from armlink.errors import BadInput, Refused
-    from calib.arm.stated_model import stated_model
+    from calib.arm.kinematics import stated_model
     from calib.commands.options import gravity_model
     from calib.commissioning.model_checks import mass_error
     from calib.records.store import RecordStore, way_to

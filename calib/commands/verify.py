@@ -41,8 +41,8 @@ def verify(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.extras import require_extra
     from armlink.loop.open import open_arm
+    from calib.arm.kinematics import with_tool
     from calib.arm.sweep_section import sweep_motion
-    from calib.arm.tool import with_tool
     from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify

@@ -9,7 +9,7 @@ from calib.commands.options import JsonFile, KeepGoing, Store, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
-    from calib.fit.payload import Payload
+    from calib.fit.field_fit import Payload
 
 
 def weigh(
@@ -36,7 +36,7 @@ def weigh(
     from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
-    from calib.sweep.weigh import run_weigh
+    from calib.sweep.verify import run_weigh
 
     arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
     gravity, calibration = records.required(GravityRecord, arm_file), records.required(CalibrationRecord, arm_file)

@@ -20,8 +20,7 @@ from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
 from armlink.loop.open import is_in_process
 from calib.commissioning.draft import assumed_lines
-from calib.commissioning.model_checks import arm_errors, gain_errors, model_findings
-from calib.commissioning.motion_checks import motion_findings
+from calib.commissioning.model_checks import arm_errors, gain_errors, model_findings, motion_findings
 from gcomp.errors import GcompError
 
 INTERFACES = Path("/sys/class/net")

@@ -13,7 +13,6 @@ from armlink.arm_file import SIMULATED, STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.chain import Chain
-from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
 from gcomp.arrays import Array
 
@@ -121,14 +120,6 @@ def draft_of_model(
     servo = f"{', '.join(free)} {'have' if len(free) > 1 else 'has'} no stop to be pressed on" if free else None
     ends = path.stem, path, tip, gravity, joints, chain.aside, notes
     return Draft(*ends, base=chain.base, servo=servo, locked=locked or {})
-
-
-def narrow(draft: Draft, found: ClearRange) -> None:
-    """Take a narrower range of every joint into the draft, which is no range between stops any more."""
-    for joint, low, high in zip(draft.joints, found.lower, found.upper, strict=True):
-        joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
-        joint.notes = [note.replace("to be the limits", "to lie within the limits") for note in joint.notes]
-    draft.servo = f"the range under kinematics.stops is narrower than the model's limits ({found.reason})"
 
 
 @dataclass(frozen=True)

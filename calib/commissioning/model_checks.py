@@ -1,8 +1,10 @@
 """Whether a model and its torque limits can be those of an arm: one judgement for all that rests upon them.
 
-And findings about joints, limits, meshes and gravity.
+And findings about joints, limits, meshes and gravity, and about what the drives must do: hold the arm, press joints on
+their stops, sweep without a collision.
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,13 +14,16 @@ from armlink.drives.findings import SetupFinding
 from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
 from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
-from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
-from calib.arm.sweep_section import sweep_motion
-from calib.plan.creep_plan import refuse_unbearable_creeps
-from calib.plan.rough_gravity import HAND, guess_of_file, reach
-from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
+from calib.arm.sweep_section import sweep_motion, sweep_section
+from calib.plan.collisions import check_plan
+from calib.plan.creep_plan import plan_creep, refuse_unbearable_creeps
+from calib.plan.planned_arm import PlannedArm
+from calib.plan.rough_gravity import HAND, GravityGuess, guess_of_file, guess_of_model, reach
+from calib.plan.stop_selection import stop_combinations
+from calib.plan.sweep_plan import DEAD_LEVER, plan_sweep, refuse_unbearable_mass
 from gcomp.arm.arm import Arm
-from gcomp.arm.load import ModelArm
+from gcomp.arm.load import ModelArm, joint_inertias
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_torque
@@ -115,25 +120,23 @@ def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
         yield SetupFinding("error", what, f"{arm_file.path}: link.joints", remedy)
         return
     if model is not None:
-        yield from _strength_errors(arm_file, model)
+        yield from (found for found in _strength(arm_file, model) if found.level == "error")
 
 
 def largest_levers(arm: Arm) -> Array:
     """Γ/g (n,) of each joint at its largest in the range of the joints; NaN where there is no gravity."""
     with np.errstate(invalid="ignore"):
-        levers: Array = gravity_levers(arm, _poses(arm)).max(axis=0) / np.linalg.norm(arm.gravity)
-    return levers
+        return np.asarray(gravity_levers(arm, _poses(arm)).max(axis=0) / np.linalg.norm(arm.gravity))
 
 
 def gravity_need(model: ModelArm) -> Array:
     """Largest torque against gravity (n,) [N·m] in the range of the joints."""
-    need: Array = np.abs(gravity_torque(model.arm, model.beta, _poses(model.arm))).max(axis=0)
-    return need
+    return np.asarray(np.abs(gravity_torque(model.arm, model.beta, _poses(model.arm))).max(axis=0))
 
 
-def _poses(arm: Arm) -> Array:
+def _poses(arm: Arm, count: int = POSES) -> Array:
     low, high = np.nan_to_num([arm.lower, arm.upper], neginf=-np.pi, posinf=np.pi)
-    return np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    return np.random.default_rng(0).uniform(low, high, (count, arm.n))
 
 
 def mass_error(where: str, model: ModelArm) -> SetupFinding | None:
@@ -164,15 +167,17 @@ def _usual(density: float, length: float) -> str:
     return f"{float(f'{density * length**3:.1g}'):g}"
 
 
-def _strength_errors(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
+def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
+    """Joints whose drives can hardly hold the arm against gravity, or cannot."""
     most = DriveLimits.of(arm_file).max_torque
     for name, need, limit in zip(model.arm.names, gravity_need(model), most, strict=True):
+        needed = f"according to the model, gravity needs up to {need:.3g} N·m"
         if need > limit:
-            what = (
-                f"according to the model, gravity needs up to {need:.3g} N·m, but max_torque is {limit:g} N·m: "
-                "the arm would fall"
-            )
+            what = f"{needed}, but max_torque is {limit:g} N·m: the arm would fall"
             yield SetupFinding("error", what, name, "check the model's masses and max_torque, or narrow the ranges")
+        elif limit < TORQUE_RESERVE * need:
+            what = f"{needed} of max_torque {limit:g} N·m, so little torque is left"
+            yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
 SMALL_LEVER = 0.2
@@ -264,3 +269,96 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",
             )
+
+
+TORQUE_RESERVE = 1.2
+"""Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
+LEAST_DAMPING = 0.3
+"""Damping ratio of a joint that its drive holds with stiffness and damping alone; below it swings after each move."""
+FASTEST_RATE = 20.0
+"""A torque limit that is reached in less than its inverse [1/s] is a blow; a choice."""
+
+
+def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Findings about torques, stops and the sweeps; raises BadInput or Refused where no sweep can be planned."""
+    if arm_file.link is None:
+        return
+    for joint in arm_file.link.joints:
+        if joint.max_torque > 3 * joint.rated_torque:
+            what = (
+                f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g} N·m"
+            )
+            yield SetupFinding("warning", what, joint.name, "compare them with the rating and the limit of the drive")
+        if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
+            what = (
+                f"with max_torque_rate {joint.max_torque_rate:g} N·m/s the full torque comes within "
+                f"{1e3 / FASTEST_RATE:.0f} ms"
+            )
+            yield SetupFinding("hint", what, joint.name, f"about {2.5 * joint.max_torque:.3g} N·m/s is usual")
+    guess, creeping = None, sweep_motion(arm_file) == "creep"
+    if arm_file.model_path is not None:
+        model = model_arm(arm_file)
+        guess = guess_of_model(model.arm, model.beta)
+        yield from _strength(arm_file, model)
+        yield from _damping(arm_file)
+        if (
+            not creeping
+            and sweep_section(arm_file).hold == "stops"
+            and np.isfinite([model.arm.lower, model.arm.upper]).all()
+        ):
+            yield from _stops(arm_file, guess)
+    if creeping:
+        plan_creep(arm_file)  # raises where it cannot be made; the model's own findings have the joints without load
+        return
+    plan = plan_sweep(arm_file, guess)
+    check_plan(arm_file, plan)
+    for note in plan.notes:
+        what, _, remedy = note.partition(": ")
+        yield SetupFinding("warning", what, str(arm_file.path), remedy or "see docs/sweeps.md")
+
+
+def largest_inertias(arm_file: ArmFile) -> dict[str, float]:
+    """Largest inertia that each joint turns, the reference mass of a sweep included [kg·m²]; the arm has a model."""
+    placed = model_chain(arm_file)
+    poses, mass = _poses(placed.arm.arm, 100), sweep_section(arm_file).reference_mass or 0.0  # few: it changes little
+    return dict(zip(placed.arm.arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
+
+
+def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Joints that their drives hold with kp and kd, and whose kd is too low for what they turn."""
+    assert arm_file.link is not None
+    joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
+    if not joints:
+        return
+    largest = largest_inertias(arm_file)
+    for joint in joints:
+        drive, inertia = joint.settings, largest[joint.name]
+        square = drive.gear**2
+        ratio = drive.kd * square / (2 * math.sqrt(drive.kp * square * inertia))
+        if ratio < LEAST_DAMPING:
+            enough = 2 * LEAST_DAMPING * math.sqrt(drive.kp * inertia / square)
+            softer = square * (drive.kd / (2 * LEAST_DAMPING)) ** 2 / inertia
+            what = f"kd {drive.kd:g} gives a damping ratio of only {ratio:.2f} at an inertia of {inertia:.2g} kg·m²"
+            remedy = (
+                f"set kd to {enough:.2g} or more, or kp to {softer:.2g} or less, which gives a damping ratio "
+                f"of {LEAST_DAMPING:g}"
+            )
+            yield SetupFinding("warning", what, joint.name, remedy)
+
+
+def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
+    """Joints that cannot be pressed on any stop within max_torque while another is swept."""
+    planned = PlannedArm(arm_file, guess)
+    arm, ever = planned.arm, np.zeros(planned.arm.n, dtype=bool)
+    for joint in range(arm.n):
+        candidates = stop_combinations(arm, joint, planned.sweep_range(joint))
+        ever |= planned.pressable_joints(candidates).any(axis=0) & (np.arange(arm.n) != joint)
+    for name, pressed in zip(arm.names, ever, strict=True):
+        if pressed or arm.n == 1:
+            continue
+        yield SetupFinding(
+            "warning",
+            "this joint cannot be pressed on a stop within max_torque",
+            name,
+            "hold joints at rest by their position loops (`sweep: {hold: servo}`), or allow more torque",
+        )

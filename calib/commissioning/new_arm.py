@@ -1,21 +1,88 @@
-"""Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
+"""Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so.
 
-from collections.abc import Mapping, Sequence
+An arm that touches itself or its surroundings within its model's limits gets narrower ranges.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole, writing
 from armlink.content.file_content import parse_yaml
 from armlink.drives.findings import FoundDrives, SetupFinding
-from armlink.errors import BadInput
+from armlink.errors import ArmlinkError, BadInput
+from calib.arm.kinematics import model_arm, model_chain
 from calib.commissioning.chain import Chain, ModelJoint, find_chains, model_joints
-from calib.commissioning.clear_range import clear_ranges, sweep_problem
-from calib.commissioning.draft import Draft, arm_text, draft_of_model, narrow
-from calib.commissioning.drive_match import Ask
+from calib.commissioning.draft import Draft, arm_text, draft_of_model
+from calib.commissioning.drive_match import Ask, match_drives, wired_text
 from calib.commissioning.model_checks import file_findings, model_errors
-from calib.commissioning.wiring import match_drives, wired_text
+from calib.plan.collisions import Geometry, check_plan
+from calib.plan.rough_gravity import guess_of_file
+from calib.plan.sweep_plan import plan_sweep
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
+from gcomp.errors import GcompError
+
+WIDTH_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16)
+"""Widths of the range that are tried, as shares of the model's."""
+CENTRES = 80
+"""Drawn poses about which a range is looked for, besides the middle of the joints' and the model's own pose."""
+SKETCH, PROOF = 40, 400
+"""Poses at which a range is looked at while choosing and in the end; half of them are corners."""
+
+
+def clear_ranges(arm_file: ArmFile) -> Iterator[tuple[Array, Array]]:
+    """Lower and upper ends (n,) [rad] of joint ranges without collision at every pose looked at here, widest first.
+
+    One of each width; a later one is for arms whose sweeps collide all the same, between these poses.
+    """
+    geometry = Geometry(arm_file)
+    if geometry.model.ngeom == 0:
+        return
+    placed, generator = model_chain(arm_file), np.random.default_rng(0)
+    arm = model_arm(arm_file, placed).arm
+    own = np.clip(placed.reference, arm.lower, arm.upper)
+    drawn = generator.uniform(arm.lower, arm.upper, (CENTRES, arm.n))
+    centres = np.concatenate([[(arm.lower + arm.upper) / 2, own], drawn])
+    centres = centres[geometry.free(centres)]
+    for share in WIDTH_SHARES:
+        boxes = [_box(arm, centre, share) for centre in centres]
+        for low, high in boxes:
+            sketched = geometry.free(_poses((low, high), SKETCH, generator)).all()
+            if sketched and geometry.free(_poses((low, high), PROOF, generator)).all():
+                yield low, high
+                break
+
+
+def sweep_problem(arm_file: ArmFile) -> Exception | None:
+    """The error that planning the sweeps ends with, None if it succeeds."""
+    guess = guess_of_file(arm_file)
+    try:
+        for seed in (0, 1):  # plans that must be clear for a range to be kept
+            check_plan(arm_file, plan_sweep(arm_file, seed=seed))
+            check_plan(arm_file, plan_sweep(arm_file, guess, seed=seed))
+    except (ArmlinkError, GcompError) as error:
+        return error
+    return None
+
+
+def _box(arm: Arm, centre: Array, share: float) -> tuple[Array, Array]:
+    """`share` of the range about `centre`, moved within the limits."""
+    half = share * (arm.upper - arm.lower) / 2
+    middle = np.clip(centre, arm.lower + half, arm.upper - half)
+    return middle - half, middle + half
+
+
+def _poses(box: tuple[Array, Array], count: int, generator: np.random.Generator) -> Array:
+    low, high = box
+    shares = generator.random((count, len(low)))
+    shares[: count // 2] = np.round(shares[: count // 2])
+    return low + shares * (high - low)
 
 
 class Questions(Protocol):
@@ -111,8 +178,12 @@ def _narrow_until_clear(made: NewArm) -> None:
     problem = sweep_problem(arm_file)
     if problem is None:
         return
-    for clear in clear_ranges(arm_file, problem):
-        narrow(made.draft, clear)
+    reason = str(problem).removeprefix(f"{arm_file.name}: ").partition(": narrow")[0]
+    for lower, upper in clear_ranges(arm_file):
+        for joint, low, high in zip(made.draft.joints, lower, upper, strict=True):
+            joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
+            joint.notes = [note.replace("to be the limits", "to lie within the limits") for note in joint.notes]
+        made.draft.servo = f"the range under kinematics.stops is narrower than the model's limits ({reason})"
         if sweep_problem(made.parsed()) is None:
             return
     raise problem

@@ -30,10 +30,9 @@ from calib.daemon.observation.observation import ActiveObservation, ObserverFeed
 from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
-from calib.daemon.state.arm_state import ArmState
+from calib.daemon.state.arm_state import ArmState, BusiestMinute, LiveWindow, Recordings
 from calib.daemon.state.events import EventLog, Hub
 from calib.daemon.state.journal import Journal
-from calib.daemon.state.samples import BusiestMinute, LiveWindow, Recordings
 from calib.daemon.view import State
 from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import Recalibrator

@@ -19,7 +19,7 @@ from calib.daemon.state.arm_state import LONGEST_PAUSE
 from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
-from calib.external.live import LiveExternal
+from calib.external.listening import LiveExternal
 from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.load import PlacedChain

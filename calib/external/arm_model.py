@@ -1,4 +1,7 @@
-"""The model of external torque of an arm: from its records, or from a model file alone, and its own work."""
+"""The model of external torque of an arm: from its records, or from a model file alone, and its own work.
+
+Before any work is seen the arm is believed to be as these say, and to lack what sound arms lack.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,16 +10,177 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
-from calib.arm.stated_model import StatedModel
-from calib.external.even_samples import even_samples, rate_of
-from calib.external.sound_arm import LINK, MOTOR, prior_of_model, with_calibration, with_gravity
+from calib.arm.kinematics import StatedModel
 from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.arm.arm import Arm
 from gcomp.arm.load import bar_inertials
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
 from gcomp.external.external_model import ROWS_RATE, ArmPrior, ExternalModel, from_records, learn
-from gcomp.external.filtered_rows import Samples
-from gcomp.external.rigid_motion import LINK_PARAMETERS
+from gcomp.external.filtered_rows import JOINT_COLUMNS, WAVES, Samples
+from gcomp.external.rigid_motion import LINK_PARAMETERS, gravity_split
+from gcomp.identify.motor_model import MotorDoubt
+
+LEAST_MASS = 0.02
+"""Of the arm's mass: what a link that the model leaves out may have."""
+LEAST_REACH = 0.05
+"""Distance of a link's mass from its axis, at least [m]."""
+MASS_DOUBT, PLACE_DOUBT = 0.2, 0.3
+"""Standard deviations of a model's masses, as a share, and of centres and radii of gyration, as a share of a link's
+length; a choice, which a baseline corrects."""
+
+
+_MOTOR = MotorDoubt()
+
+
+@dataclass(frozen=True)
+class JointDoubt:
+    """Standard deviations of a joint's own parameters; torques as shares of the joint's scale, the others per SI."""
+
+    offset: float
+    coulomb: float
+    load: float
+    viscous: float
+    rotor: float
+    gain: float
+    waves: float
+    noise: float
+
+    def std(self, scale: Array) -> Array:
+        """(n, C) as in `gcomp.external.filtered_rows`."""
+        of = {
+            "offset": self.offset * scale,
+            "coulomb": self.coulomb * scale,
+            "coulomb_wide": 0.5 * self.coulomb * scale,
+            "breakaway": 0.3 * self.coulomb * scale,
+            "load": self.load + 0.0 * scale,
+            "viscous": self.viscous * scale,
+            "quadratic": self.viscous * scale,
+            "uneven_cos": 0.2 * self.coulomb * scale,
+            "uneven_sin": 0.2 * self.coulomb * scale,
+            "warm_coulomb": 0.02 * self.coulomb * scale,
+            "warm_viscous": 0.02 * self.viscous * scale,
+            "warm_offset": 1e-3 * self.offset * scale,
+            "warm_gain": _MOTOR.warming + 0.0 * scale,
+            "rotor": self.rotor * scale,
+            "gain": self.gain + 0.0 * scale,
+        }
+        own = np.stack([of[name] for name in JOINT_COLUMNS], axis=-1)
+        return np.hstack([own, np.repeat(self.waves * scale[:, None], WAVES, axis=1)])
+
+
+MOTOR = JointDoubt(
+    _MOTOR.offset_share, _MOTOR.coulomb_share, _MOTOR.load, 5 * _MOTOR.viscous_share, 0.05, 0.15, 0.02, 0.03
+)
+"""Torque that is a motor current, as of a fit of creeping joints; rotors take up to a twentieth of rated torque per
+rad/s²."""
+LINK = JointDoubt(0.03, 0.03, 0.02, 0.02, 0.002, 0.05, 0.01, 0.01)
+"""Torque of a sensor beyond the transmission: bearings, seals and cables alone rub."""
+
+
+def prior_of_model(arm: Arm, links: Array, doubt: JointDoubt, scale: Array) -> ArmPrior:
+    """Of inertials (n, 10) in bar frames that nothing has confirmed."""
+    n = arm.n
+    mass = np.maximum(links[:, 0], LEAST_MASS * links[:, 0].sum())
+    reach = np.maximum(np.linalg.norm(arm.span, axis=1), LEAST_REACH)
+    std = np.empty((n, LINK_PARAMETERS))
+    std[:, 0] = MASS_DOUBT * mass
+    std[:, 1:4] = (PLACE_DOUBT * mass * reach)[:, None]
+    std[:, 4:] = (PLACE_DOUBT * mass * reach**2)[:, None]
+    back = np.linalg.inv(gravity_split(arm)) * std.ravel()
+    joints_std = doubt.std(scale)
+    return ArmPrior(links, back @ back.T, np.zeros_like(joints_std), joints_std, doubt.noise * scale)
+
+
+def with_gravity(prior: ArmPrior, arm: Arm, gravity: GravityRecord, beta: Array) -> ArmPrior:
+    """With a record's mass moments in place of those of the links, `beta` (2 n,)."""
+    n = arm.n
+    links, covariance = prior.links.copy(), prior.covariance.copy()
+    links[:, 1:3] += (np.array(gravity.beta) - beta).reshape(n, 2)
+    covariance[: 2 * n] = covariance[:, : 2 * n] = 0.0
+    covariance[: 2 * n, : 2 * n] = np.array(gravity.covariance)
+    return replace(prior, links=links, covariance=covariance)
+
+
+def with_calibration(prior: ArmPrior, calibration: CalibrationRecord) -> ArmPrior:
+    """With a record's friction, and how sure it is of gains and offsets."""
+    mean, std, noise = prior.joints.copy(), prior.joints_std.copy(), prior.noise.copy()
+    at = {name: k for k, name in enumerate(JOINT_COLUMNS)}
+    gain, offset = calibration.std("gain"), calibration.std("offset")
+    level = calibration.discrepancy("level")
+    for j, joint in enumerate(calibration.joints):
+        size = abs(joint.gain or 1.0)
+        if np.isfinite(gain[j]):
+            std[j, at["gain"]] = gain[j] / size
+        if np.isfinite(offset[j]):
+            std[j, at["offset"]] = offset[j] / size
+        if joint.residual_std is not None:
+            noise[j] = joint.residual_std / size
+        if level[j] > 0.0:
+            std[j, len(at) :] = level[j]
+        if joint.motor is not None:
+            for name in ("coulomb", "load", "viscous"):
+                mean[j, at[name]], std[j, at[name]] = getattr(joint.motor, name)
+    return replace(prior, joints=mean, joints_std=std, noise=noise)
+
+
+FASTEST = 250.0
+"""Samples a second at most [Hz]: ten a row."""
+LONGEST_GAP = 0.3
+"""Between two rows of a recording [s]; a longer one parts it in two."""
+SHORTEST = 1.0
+"""Of a part [s] that counts."""
+
+
+def averaged_samples(t: Array, rate: float) -> int:
+    """How many samples at times (K,) [s] go into a value at `rate` [Hz]: all of its period, to the 2 % that clocks are
+    apart."""
+    return max(1, int(1.02 / (rate * float(np.median(np.diff(t))))))
+
+
+def rate_of(recordings: Sequence[Recording]) -> float:
+    """The rate at which all of them are sampled [Hz], a multiple of the rows' rate. Raises BadInput if too slow."""
+    slowest = min(1.0 / float(np.median(np.diff(each.t))) for each in recordings)
+    if slowest < 0.8 * ROWS_RATE:
+        raise BadInput(f"the slowest recording has {slowest:.1f} rows a second, expected at least {ROWS_RATE:g}")
+    return ROWS_RATE * max(1, round(min(slowest, FASTEST) / ROWS_RATE))
+
+
+def even_samples(
+    recording: Recording, channel: str, rate: float, warm: Array | None = None
+) -> list[tuple[Array, Samples]]:
+    """Times [s] and samples of each part without a gap; `warm` (n,) [°C] is the temperature that counts as none."""
+    torque = getattr(recording, channel)
+    known = np.isfinite(recording.position).all(1) & np.isfinite(torque).all(1)
+    t = recording.t[known]
+    velocity = recording.velocity
+    if velocity is None or not np.isfinite(velocity[known]).all():
+        velocity = None
+    parts, cuts = [], np.flatnonzero(np.diff(t) > LONGEST_GAP) + 1
+    for index in np.split(np.arange(len(t)), cuts):
+        if len(index) < 2 or t[index[-1]] - t[index[0]] < SHORTEST:
+            continue
+        even = np.arange(t[index[0]], t[index[-1]], 1.0 / rate)
+        q = _resampled(even, t[index], recording.position[known][index], rate)
+        v = np.gradient(q, 1.0 / rate, axis=0)
+        if velocity is not None:
+            v = _resampled(even, t[index], velocity[known][index], rate)
+        warmth = np.zeros_like(q)
+        if warm is not None and recording.temperature is not None:
+            warmth = np.nan_to_num(_resampled(even, t[index], recording.temperature[known][index], rate) - warm)
+        parts.append((even, Samples(q, v, _resampled(even, t[index], torque[known][index], rate), warmth)))
+    return parts
+
+
+def _resampled(even: Array, t: Array, values: Array, rate: float) -> Array:
+    """Means over a period where the recording is faster, else straight lines between its rows."""
+    count = averaged_samples(t, rate)
+    if count >= 2:
+        kernel = np.ones(count) / count
+        pad = np.pad(values, ((count // 2, count - 1 - count // 2), (0, 0)), mode="edge")
+        values = np.stack([np.convolve(column, kernel, mode="valid") for column in pad.T], axis=1)
+    return np.stack([np.interp(even, t, column) for column in values.T], axis=1)
+
 
 LARGEST_SHARE = 99
 """Percentile of its torques that is a joint's scale, where no rating is known."""

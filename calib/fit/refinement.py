@@ -162,8 +162,7 @@ class Linear:
     @property
     def leverage(self) -> Array:
         """Leverage of each reading on its own prediction (P,), 0 to 1."""
-        part: Array = 1 - np.diag(self.annihilator)
-        return part
+        return 1 - np.diag(self.annihilator)
 
 
 @dataclass(frozen=True, eq=False)

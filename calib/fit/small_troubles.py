@@ -59,8 +59,7 @@ class PositionField:
 
     def columns(self, poses: Array) -> Array:
         """φ at poses (K, n) → (K, L)."""
-        columns: Array = kernel(poses, self.landmarks, self.length) @ self.root.T
-        return columns
+        return kernel(poses, self.landmarks, self.length) @ self.root.T
 
 
 def kernel(one: Array, other: Array, length: float) -> Array:
@@ -71,8 +70,7 @@ def kernel(one: Array, other: Array, length: float) -> Array:
 def squared_distance(one: Array, other: Array) -> Array:
     """Squared distance (K, M) of poses: Σ_l (2 sin(Δ_l/2))² = 2 Σ_l (1 − cos Δ_l), a turn of a joint being none."""
     cos, sin = np.cos(one) @ np.cos(other).T, np.sin(one) @ np.sin(other).T
-    distance: Array = np.maximum(2 * (one.shape[1] - cos - sin), 0.0)
-    return distance
+    return np.asarray(np.maximum(2 * (one.shape[1] - cos - sin), 0.0))
 
 
 TURNS = (0.1, 0.3, 0.8)
@@ -221,8 +219,7 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
         """Change of true torque as all from a joint on turns about an axis (K, 3) [N·m/rad]."""
         beyond = np.einsum("kd,kid->ki", np.cross(axis, arm.gravity), turned)
         before = np.einsum("kid,kd->ki", frames.lever, np.cross(axis, whole[:, joint]))
-        change: Array = np.where(np.arange(n) >= joint, beyond, before)
-        return change
+        return np.asarray(np.where(np.arange(n) >= joint, beyond, before))
 
     upright = n - len(base_parameter_names(arm)) // 2  # leading joints along gravity, whose moments nothing tells
     unseen = float(np.sqrt((torque**2).mean(axis=0)).max()) / float(np.linalg.norm(arm.gravity))
@@ -307,5 +304,4 @@ def _waves(time: Array, span: tuple[float, float]) -> Array:
     """Terms (WAVES, K) of a random walk of unit variance over the span that ends at zero at its end."""
     back = (span[1] - time) / max(span[1] - span[0], 1e-9)
     rate = (np.arange(1, WAVES + 1) - 0.5)[:, None] * np.pi
-    waves: Array = np.sqrt(2) * np.sin(rate * back) / rate
-    return waves
+    return np.asarray(np.sqrt(2) * np.sin(rate * back) / rate)

@@ -84,8 +84,7 @@ class SweepReadings:
     @property
     def own(self) -> Mask:
         """Readings of the swept joint's own sensor (K, n)."""
-        own: Mask = np.arange(self.readings.position.shape[1]) == self.swept[:, None]
-        return own
+        return np.asarray(np.arange(self.readings.position.shape[1]) == self.swept[:, None])
 
     @property
     def masses(self) -> tuple[float, ...]:

@@ -113,8 +113,7 @@ class CheckMotion:
     def _rms(self, readings: list[StaticReading], beta: Array) -> Array:
         q = self._record.angle(stack(readings, "position"))
         residual: Array = stack(readings, "torque") - gravity_torque(gcomp_arm(self._arm), beta, q)
-        rms: Array = np.sqrt(np.mean(residual**2, axis=0))
-        return rms
+        return np.asarray(np.sqrt(np.mean(residual**2, axis=0)))
 
 
 def check_poses(begin: Array, limits: DriveLimits) -> Array:
@@ -123,5 +122,4 @@ def check_poses(begin: Array, limits: DriveLimits) -> Array:
     signs = np.array([np.where((joints >> bit) & 1, 1.0, -1.0) for bit in range(POSES // 2)])
     poses = begin + AMPLITUDE * np.concatenate([signs, -signs])
     margin = np.minimum(MARGIN, (limits.upper - limits.lower) / 4)
-    inside: Array = np.clip(poses, limits.lower + margin, limits.upper - margin)
-    return inside
+    return np.clip(poses, limits.lower + margin, limits.upper - margin)

@@ -238,5 +238,4 @@ def history_std(past: Array, usual: float) -> Array:
     """
     known = np.clip(np.nan_to_num(past), -DEVIATIONS * usual, DEVIATIONS * usual)
     counts = USUAL_COUNTS + np.isfinite(past).sum(axis=0)
-    std: Array = np.sqrt((USUAL_COUNTS * usual**2 + (known**2).sum(axis=0)) / counts)
-    return std
+    return np.asarray(np.sqrt((USUAL_COUNTS * usual**2 + (known**2).sum(axis=0)) / counts))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.saved_values import known
+from calib.observer.rests import known
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -81,8 +81,7 @@ class Kernel:
     def between(self, a: Points, b: Points) -> Array:
         """Covariance (parts, n, A, B) between two sets of poses, joint by joint, of each part at size 1."""
         parts, common = self._shapes(a, b)
-        covariance: Array = (1.0 - CONSTANT - SLOPE - SIDE) * np.stack(parts) + common
-        return covariance
+        return (1.0 - CONSTANT - SLOPE - SIDE) * np.stack(parts) + common
 
     def weighted(self, smooth: Array, a: Points, b: Points) -> Array:
         """Covariance (n, A, B) between two sets of poses from the sizes of the parts (parts, n) [N·m]."""
@@ -164,8 +163,7 @@ class DiscrepancyLevel:
     @property
     def total(self) -> Array:
         """Of all parts together (n,) [N·m]."""
-        total: Array = np.sqrt((self.smooth**2).sum(axis=0) + self.rough**2)
-        return total
+        return np.asarray(np.sqrt((self.smooth**2).sum(axis=0) + self.rough**2))
 
     @property
     def is_known(self) -> bool:

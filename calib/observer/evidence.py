@@ -97,8 +97,7 @@ class ResidualTest:
         """Where nothing has changed."""
 
     def whitened(self, columns: Array) -> Array:
-        white: Array = np.linalg.solve(self._root, columns)  # scipy takes longer to load
-        return white
+        return np.linalg.solve(self._root, columns)  # scipy takes longer to load
 
     def index(self, cause: str, joint: int | None) -> int:
         """Number of a hypothesis; raises ValueError where there is none."""

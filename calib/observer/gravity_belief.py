@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.observer.discrepancy import DiscrepancyLevel, Kernel, Posterior, Reference, Rows
-from calib.observer.saved_values import restored
+from calib.observer.rests import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
@@ -49,15 +49,14 @@ class Expected:
         """Covariance (K, K) of one joint's residuals."""
         n = len(self.blocks)
         columns = self.columns[j::n]
-        covariance: Array = self.blocks[j] + columns @ columns.T
-        return covariance
+        return np.asarray(self.blocks[j] + columns @ columns.T)
 
     @property
     def variance(self) -> Array:
         """(K, n) [N²·m²]."""
         n, count, _ = self.blocks.shape
-        variance: Array = np.diagonal(self.blocks, axis1=1, axis2=2).T + (self.columns**2).sum(axis=1).reshape(count, n)
-        return variance
+        own = np.diagonal(self.blocks, axis1=1, axis2=2).T
+        return np.asarray(own + (self.columns**2).sum(axis=1).reshape(count, n))
 
 
 class GravityBelief:
@@ -116,8 +115,7 @@ class GravityBelief:
 
     def torque(self, q: Array) -> Array:
         """Gravity torque (K, n) [N·m] at poses q (K, n)."""
-        torque: Array = gravity_regressor(self.arm, q) @ self.beta
-        return torque
+        return gravity_regressor(self.arm, q) @ self.beta
 
     def expected(self, q: Array, side: Array, temperature: Array | None = None) -> Expected:
         """Residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""

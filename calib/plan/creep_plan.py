@@ -12,7 +12,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.plan.collisions import POINTS
-from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
+from calib.plan.plan_limits import ROUNDING, refuse_unfit, require_bounds
 from calib.plan.planned_arm import COLLIDING, PlannedArm
 from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, guess_of_file, is_vertical, known_lever
 from calib.plan.sweep_plan import MASS_SHARES
@@ -90,8 +90,7 @@ def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: fl
     )
     _, jacobian = MotorModel(arm, readings).linearised(x)
     jacobian /= SCATTER_SHARE * rated[one.joint]
-    information: Array = jacobian.T @ jacobian
-    return information
+    return jacobian.T @ jacobian
 
 
 CANDIDATES = 24
@@ -196,7 +195,7 @@ def refuse_unbearable_creeps(arm_file: ArmFile, mass: float) -> None:
 
 def check_creep_limits(creeping: CreepingArm, arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
-    require_bounds(arm_file, plan, PoseBounds(creeping.ends, creeping.ends, creeping.ends))
+    require_bounds(arm_file, plan, creeping.ends, creeping.ends, creeping.ends)
     refuse_unfit(arm_file, _unfit(creeping, plan))
 
 

@@ -4,7 +4,6 @@ A plan on disk may have been changed since it was made, and so may the arm file.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,16 +20,8 @@ ROUNDING = 1e-6
 """Share of a value, or [rad], by which arithmetic in another order may differ: far above that of 64-bit numbers."""
 
 
-@dataclass(frozen=True)
-class PoseBounds:
-    """Lower and upper bounds of a plan's poses, each (n,) [rad]."""
-
-    moving: tuple[Array, Array]
-    """Of joints on their way, scout poses included."""
-    held: tuple[Array, Array]
-    """Of joints that rest in their servo."""
-    pressed: tuple[Array, Array]
-    """Of joints that rest on a stop: the stops."""
+Ends = tuple[Array, Array]
+"""Lower and upper bounds of poses, each (n,) [rad]."""
 
 
 def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
@@ -39,7 +30,7 @@ def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     limits, ends = planned.limits, np.array([planned.sweep_range(joint) for joint in range(planned.arm.n)]).T
     stops = (limits.lower, limits.upper)
     held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
-    require_bounds(arm_file, plan, PoseBounds((ends[0], ends[1]), held, stops))
+    require_bounds(arm_file, plan, (ends[0], ends[1]), held, stops)
     refuse_unfit(arm_file, _of_drives(plan, planned))
 
 
@@ -48,10 +39,11 @@ def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
     refuse_unfit(arm_file, (f"sweep {sweep.name}: `bias` is missing" for sweep in plan.sweeps if sweep.bias is None))
 
 
-def require_bounds(arm_file: ArmFile, plan: SweepPlan, bounds: PoseBounds) -> None:
-    """Raise Refused where a plan has another number of joints, or a pose beyond the bounds."""
+def require_bounds(arm_file: ArmFile, plan: SweepPlan, moving: Ends, held: Ends, pressed: Ends) -> None:
+    """Raise Refused where a plan has another number of joints, or a pose beyond the bounds: of joints on their way,
+    scout poses included, of those that rest in their servo, and of those on a stop."""
     refuse_unfit(arm_file, _of_shape(plan, len(arm_file.joint_names)))
-    refuse_unfit(arm_file, _of_poses(plan, bounds, arm_file.joint_names))
+    refuse_unfit(arm_file, _of_poses(plan, moving, held, pressed, arm_file.joint_names))
 
 
 def refuse_unfit(arm_file: ArmFile, found: Iterator[str]) -> None:
@@ -88,14 +80,14 @@ def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
             yield f"sweep {sweep.name}: one joint is held neither on a stop nor by its position loop"
 
 
-def _of_poses(plan: SweepPlan, bounds: PoseBounds, names: Sequence[str]) -> Iterator[str]:
+def _of_poses(plan: SweepPlan, moving: Ends, held: Ends, pressed: Ends, names: Sequence[str]) -> Iterator[str]:
     for number, pose in enumerate(plan.scout, start=1):
-        yield from _beyond(f"scout pose {number}", np.array(pose), *bounds.moving, names)
+        yield from _beyond(f"scout pose {number}", np.array(pose), *moving, names)
     for sweep in plan.sweeps:
         servo = np.array(sweep.servo)
-        stop = np.where(np.array(sweep.stops) > 0, bounds.pressed[1], bounds.pressed[0])
-        lower, upper = (np.where(servo, each, stop) for each in bounds.held)
-        lower[sweep.joint], upper[sweep.joint] = (each[sweep.joint] for each in bounds.moving)
+        stop = np.where(np.array(sweep.stops) > 0, pressed[1], pressed[0])
+        lower, upper = (np.where(servo, each, stop) for each in held)
+        lower[sweep.joint], upper[sweep.joint] = (each[sweep.joint] for each in moving)
         for what, step in (("first step", sweep.steps[0]), ("last step", sweep.steps[-1])):
             there = np.array(sweep.rest)
             there[sweep.joint] = step

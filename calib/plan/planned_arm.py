@@ -22,7 +22,8 @@ COLLIDING = (
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]: a step of 0.5 rad then takes 2.6 s; a choice."""
 FASTEST = 2.0
-"""Largest acceleration between sweeps [rad/s²]; a choice, swept in tests/campaigns/random_arms.py."""
+"""Largest acceleration between sweeps, and between poses of a verification [rad/s²]; a choice, swept in
+tests/campaigns/random_arms.py."""
 
 
 class PlannedArm:

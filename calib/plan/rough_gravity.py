@@ -37,21 +37,18 @@ class GravityGuess:
 
     def torque(self, q: Array) -> Array:
         """Holding torque (…, n) [N·m] at poses q (…, n) [rad]."""
-        torque: Array = gravity_regressor(self.kinematics, q) @ self.beta
-        return torque
+        return gravity_regressor(self.kinematics, q) @ self.beta
 
     def uncertainty(self, q: Array) -> Array:
         """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
         regressor = gravity_regressor(self.kinematics, q)
         variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
-        bound: Array = BOUND_DEVIATIONS * np.sqrt(np.maximum(variance, 0.0))
-        return bound
+        return np.asarray(BOUND_DEVIATIONS * np.sqrt(np.maximum(variance, 0.0)))
 
     def inertia(self) -> Array:
         """Rough upper size (n,) [kg·m²] of each joint's inertia: composite mass moment times reach."""
         moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
-        size: Array = moment * reach(self.kinematics)
-        return size
+        return np.asarray(moment * reach(self.kinematics))
 
 
 def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:

@@ -24,8 +24,7 @@ from armlink.content.yaml_text import yaml_document
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.tool import tool_covariance, tool_moments
+from calib.arm.kinematics import gcomp_arm, tool_covariance, tool_moments
 from gcomp.arrays import Array
 
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
@@ -235,8 +234,7 @@ class CalibrationRecord(ArmRecord):
 
     def angle(self, reading: Array) -> Array:
         """Joint angles (…, n) [rad] from position readings; a sensor without a calibration counts as exact."""
-        angle: Array = reading * self.values("position_gain", 1.0) + self.values("position_offset", 0.0)
-        return angle
+        return reading * self.values("position_gain", 1.0) + self.values("position_offset", 0.0)
 
     def is_installed(self, held: Sequence[TorqueCalibration[float]]) -> bool:
         """Whether controllers that hold `held`, joint by joint, hold this record, as REAL32 keeps it."""

@@ -17,7 +17,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.dataset import SweepData
 from calib.fit.calibration import rms
 from calib.fit.creep_fit import CreepFit
-from calib.fit.heldout import heldout_scores
+from calib.fit.gravity_fit import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, GravityRecord

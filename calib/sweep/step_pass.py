@@ -3,7 +3,7 @@
 The scout is a few servo-held poses at which every sensor is read, before anything is pressed.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.motion.mover import Mover, Slipped, Stalled
+from calib.motion.mover import Slipped, Stalled
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.collisions import check_plan
 from calib.plan.plan_limits import check_bias, check_limits
@@ -25,35 +25,6 @@ SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""
 SLOWER, SLOWEST = 0.4, 0.15
 """Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
-
-
-def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[StaticReading], None]) -> None:
-    """Read every scout pose that is not `done`, each passed to `save`; a pose that the drives cannot reach is left out.
-
-    Raises Stalled where too few poses were reached to know the arm's weight.
-    """
-    n = mover.link.n
-    everything = np.ones(n, dtype=bool)
-    acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
-    for index, pose in enumerate(plan.scout):
-        if index in done:
-            continue
-        stalls = list[Stalled]()
-        for goal in (np.array(pose), np.array(pose), last):
-            try:
-                mover.travel(goal, acceleration)
-                break
-            except Stalled as stall:
-                stalls.append(stall)
-                mover.come_to_rest()
-                acceleration = max(SLOWER * acceleration, SLOWEST)
-        if len(stalls) > 1:
-            unreached.append(stalls[0])
-            continue
-        save(mover.rest(everything).within(SCOUT, index, everything))
-        last = mover.position.copy()
-    if len(plan.scout) - len(unreached) < 4:
-        raise unreached[0]
 
 
 def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess:
@@ -115,11 +86,36 @@ class StepPass(SweepPass):
     def _scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""
         while True:
-            done = {reading.index for reading in self.readings if reading.sweep == SCOUT}
             try:
-                return run_scout(self.mover, plan, done, self._save)
+                return self._read_scout(plan)
             except Stall as stall:
                 self.bridge(stall, f"{SCOUT} {sum(reading.sweep == SCOUT for reading in self.readings) + 1}")
+
+    def _read_scout(self, plan: SweepPlan) -> None:
+        """A pose that the drives cannot reach is left out; raises Stalled where too few were reached to know the arm's
+        weight."""
+        mover, done = self.mover, {reading.index for reading in self.readings if reading.sweep == SCOUT}
+        everything = np.ones(mover.link.n, dtype=bool)
+        acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
+        for index, pose in enumerate(plan.scout):
+            if index in done:
+                continue
+            stalls = list[Stalled]()
+            for goal in (np.array(pose), np.array(pose), last):
+                try:
+                    mover.travel(goal, acceleration)
+                    break
+                except Stalled as stall:
+                    stalls.append(stall)
+                    mover.come_to_rest()
+                    acceleration = max(SLOWER * acceleration, SLOWEST)
+            if len(stalls) > 1:
+                unreached.append(stalls[0])
+                continue
+            self._save(mover.rest(everything).within(SCOUT, index, everything))
+            last = mover.position.copy()
+        if len(plan.scout) - len(unreached) < 4:
+            raise unreached[0]
 
     def sweep(self, sweep: Sweep) -> None:
         """Take the readings of one sweep that are still to be taken; a joint that slips is pressed again."""

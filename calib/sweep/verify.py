@@ -1,11 +1,13 @@
 """Verification: model against sensor torque at held-out poses, as Figure 6 of [MH97] (docs/theory.md, section 3).
 
 A torque sensor is read at rest. Of a drive whose torque is a motor current, the half sum of two short creeps, there and
-back, is read, which is without friction.
+back, is read, which is without friction. Poses that the drives do not reach are left out.
+
+A payload is weighed in the same way: it is what the torques show beyond the gravity record.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,18 +20,18 @@ from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_motion, sweep_section
+from calib.fit.field_fit import Payload, raw_readings, weigh_payload
 from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
-from calib.plan.creep_plan import CreepingArm
-from calib.plan.planned_arm import PlannedArm, nearest_first
+from calib.plan.creep_plan import TRAVEL_ACCELERATION, CreepingArm
+from calib.plan.planned_arm import FASTEST, PlannedArm, nearest_first
+from calib.plan.sweep_plan import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-ACCELERATION = 2.0
-"""Of travel between poses [rad/s²]; a choice."""
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
 tests/calib/drawn_arms.py allows."""
@@ -48,8 +50,8 @@ CREEP_TOLERANCE = 0.02
 """TOLERANCE of creeps."""
 CREEP_FLOOR = 0.008
 """NOISE_FLOOR of creeps: friction that differs between the directions."""
-ReadAt = Callable[[Mover, Array], tuple[Array, Array] | None]
-"""Position [rad] and torque [N·m] readings (n,) at a pose (n,); back again, and None, where a joint stalls."""
+FEWEST_WEIGHED = 2
+"""Poses without which the mass of a payload and its place cannot be told apart (docs/theory.md, section 6.4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +75,12 @@ class Verification:
     @property
     def rms(self) -> Array:
         """RMS of sensor minus model (n,) [N·m]."""
-        rms: Array = np.sqrt(np.mean((self.sensor - self.model) ** 2, axis=0))
-        return rms
+        return np.asarray(np.sqrt(np.mean((self.sensor - self.model) ** 2, axis=0)))
 
     @property
     def max_error(self) -> Array:
         """Largest absolute difference (n,) [N·m]."""
-        largest: Array = np.abs(self.sensor - self.model).max(axis=0)
-        return largest
+        return np.asarray(np.abs(self.sensor - self.model).max(axis=0))
 
     @property
     def passed(self) -> bool:
@@ -119,7 +119,6 @@ def run_verify(
     beta = np.array(gravity.beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
-    read_at: ReadAt = _half_sum_at if creeping else _rest_at
     if at is None and creeping:
         at = partial(_creep_poses, CreepingArm(arm_file), poses, seed)
     elif at is None:
@@ -128,7 +127,7 @@ def run_verify(
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
-        found = repeat_work(link, on_stall, partial(read_at, mover, pose), mover.resume)
+        found = repeat_work(link, on_stall, partial(_read_at, mover, pose, creeping), mover.resume)
         if found is None:
             continue
         position, torque = found
@@ -176,18 +175,25 @@ def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array,
     gain, offset = calibration.values("gain", 1.0), np.nan_to_num(calibration.std("offset"))
     of_gain = np.nan_to_num(calibration.std("gain")) * np.abs(model)
     square = (level + 2 * level_std) ** 2 + (variance + (of_gain**2 + offset**2) / gain**2).mean(axis=0)
-    passes: Array = np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
-    return passes
+    return np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
 
 
-def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
-    begin = mover.position.copy()
+def _read_at(mover: Mover, pose: Array, creeping: bool) -> tuple[Array, Array] | None:
+    """Position [rad] and torque [N·m] readings (n,) at a pose (n,), at rest or by creeps of all joints together, up and
+    down about the pose; back again, and None, where a joint stalls."""
+    begin, up, down = mover.position.copy(), list[Sample](), list[Sample]()
     try:
-        mover.travel(pose, ACCELERATION)
+        if creeping:
+            mover.travel(pose - CREEP_WAY / 2, TRAVEL_ACCELERATION)
+            up, down = _creep(mover, CREEP_WAY), _creep(mover, -CREEP_WAY)
+        else:
+            mover.travel(pose, FASTEST)
     except Stalled:
         mover.hold_all()
-        mover.travel(begin, ACCELERATION)
+        mover.travel(begin, 1.0 if creeping else FASTEST)
         return None
+    if creeping:
+        return pose, _half_sum(up, down, pose)
     rest = mover.rest(np.ones(mover.link.n, dtype=bool))
     return rest.position, rest.torque
 
@@ -215,19 +221,6 @@ def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> 
     return np.array(found)
 
 
-def _half_sum_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
-    """By creeps of all joints together, up and down about the pose."""
-    begin = mover.position.copy()
-    try:
-        mover.travel(pose - CREEP_WAY / 2, 1.5)
-        up, down = _creep(mover, CREEP_WAY), _creep(mover, -CREEP_WAY)
-    except Stalled:
-        mover.hold_all()
-        mover.travel(begin, 1.0)
-        return None
-    return pose, _half_sum(up, down, pose)
-
-
 def _creep(mover: Mover, way: float) -> list[Sample]:
     """All joints together by `way` [rad]."""
     period, start = mover.link.period, mover.command.position.copy()
@@ -250,5 +243,41 @@ def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> Array:
                 raise Refused(f"joint {joint + 1}: there are too few samples in a creep of {CREEP_WAY} rad")
             line[joint] = np.polynomial.polynomial.polyfit(q[kept] - at, v[kept], 1)[0]
         means.append(line)
-    half_sum: Array = (means[0] + means[1]) / 2
-    return half_sum
+    return (means[0] + means[1]) / 2
+
+
+def run_weigh(
+    link: ArmDriver,
+    arm_file: ArmFile,
+    gravity: GravityRecord,
+    calibration: CalibrationRecord,
+    *,
+    poses: int = 12,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    on_stall: OnStall = give_up,
+) -> tuple[Payload, int]:
+    """(The payload, number of poses that were reached). The link must have been enabled.
+
+    Raises Refused where a record is of another arm or too few poses are reached, BadInput, BusFault.
+    """
+    creeping = sweep_motion(arm_file) == "creep"
+    found = run_verify(
+        link,
+        arm_file,
+        gravity,
+        calibration,
+        poses=poses,
+        seed=seed,
+        at=None if creeping else partial(weighing_poses, arm_file, poses, seed),
+        progress=progress,
+        on_stall=on_stall,
+    )
+    reached = len(found.sensor)
+    if reached < FEWEST_WEIGHED:
+        raise Refused(f"{reached} of {poses} poses were reached: can the drives hold the load?")
+    sigma = sweep_section(arm_file).standard_error * arm_file.require_link().rated_torques
+    readings = raw_readings(found.position, found.sensor, np.maximum(sigma, 1e-9), calibration)
+    if creeping:  # half sums of both directions
+        readings = replace(readings, direction=np.zeros_like(readings.direction))
+    return weigh_payload(arm_file, readings, gravity, calibration), reached

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.content.atomic_file import write_whole, writing
-from calib.arm.urdf import URDF, urdf_of, xml_comment
+from calib.arm.model_files import URDF, urdf_of, xml_comment
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,

@@ -10,12 +10,12 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
+from calib.fit.field_fit import Payload, raw_readings, weigh_payload
 from calib.fit.gravity_fit import identify_gravity
-from calib.fit.payload import Payload, raw_readings, weigh_payload
 from calib.fit.sensor_fit import fit_sensors
-from calib.plan.sweep_options import weighing_poses
+from calib.plan.sweep_plan import weighing_poses
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.weigh import FEWEST
+from calib.sweep.verify import FEWEST_WEIGHED
 from sim_bus.sim_section import with_realism
 
 Array = np.ndarray
@@ -61,7 +61,7 @@ class Calibrated:
             got = [self.resting.read(pose, free)[:2] for pose in at[held.all(axis=1)]]
         finally:
             simulated.detach_mass()
-        if len(got) < FEWEST:
+        if len(got) < FEWEST_WEIGHED:
             raise Refused(f"{len(got)} of {poses} poses were reached")
         shown, torque = (np.array(each) for each in zip(*got, strict=True))
         record = self.calibration

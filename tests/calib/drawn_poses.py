@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pinocchio
 
+from calib.arm.kinematics import stated_model
 from calib.arm.model_files import write_model
-from calib.arm.stated_model import stated_model
 from calib.commands.identify_poses import Judged, judged_fit
 from gcomp.gravity.torque import gravity_torque
 from sim_gap.blind.arms import BenchArm, draw_arm, mjcf

@@ -9,8 +9,7 @@ from fast_arm import FastArm
 from armlink import cli
 from armlink.arm_file import Tool, load_arm
 from armlink.errors import BadInput
-from calib.arm.kinematics import gcomp_arm, model_arm
-from calib.arm.tool import parse_tool, tool_covariance, tool_moments, with_tool
+from calib.arm.kinematics import gcomp_arm, model_arm, parse_tool, tool_covariance, tool_moments, with_tool
 from calib.daemon.observation.observation import ObserverFeed
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import observer_of

@@ -30,8 +30,7 @@ from real_arm import RealArm
 from scipy.signal import lfilter
 
 from armlink.torque_calibration import TorqueCalibration
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.stated_model import StatedModel
+from calib.arm.kinematics import StatedModel, gcomp_arm
 from calib.external.arm_model import ArmListener, ArmRecords, listener_of, prior_of
 from calib.external.listening import Heard, WrenchFrame, listen
 from calib.fit.creep_fit import fit_rows

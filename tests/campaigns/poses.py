@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from drawn_poses import draw, outcome
 from real_poses import real_poses
 
-from calib.arm.stated_model import stated_model
+from calib.arm.kinematics import stated_model
 from calib.commands.identify_poses import judged_fit
 
 SHARE, SAME_TORQUE, SECONDS = 0.95, 1e-4, 20.0

@@ -27,12 +27,12 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
     try:
         drives = search(opened)
         keys = bus_keys(bus, out, {each.family for each in drives.found})
-        made = arm_of_bus(drives, str(opened.channel_info), keys, name or out.stem, ask)
+        text, matches = arm_of_bus(drives, str(opened.channel_info), keys, name or out.stem, ask)
     finally:
         opened.shutdown()
-    arm = parse_arm(parse_yaml(made.text, out), out)
-    write_whole(out, made.text)
-    return _tell(out, arm, made.matches, "; the geometry is not known (see the file)", [], json_file)
+    arm = parse_arm(parse_yaml(text, out), out)
+    write_whole(out, text)
+    return _tell(out, arm, matches, "; the geometry is not known (see the file)", [], json_file)
 
 
 def rewire(
@@ -45,7 +45,7 @@ def rewire(
     from armlink.arm_file import Bus, load_arm, parse_arm
     from armlink.content.file_content import read_whole
     from armlink.content.yaml_text import yaml_comment
-    from calib.commissioning.wiring import match_by_ids, match_drives, wired_text
+    from calib.commissioning.drive_match import match_by_ids, match_drives, wired_text
 
     arm, opened = load_arm(model), open_named(bus)
     try:

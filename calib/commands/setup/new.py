@@ -98,8 +98,8 @@ def new(
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
+    from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm
-    from calib.commissioning.wiring import drives_have_ids
 
     console = PlainConsole()
     interactive = sys.stdin is not None and sys.stdin.isatty()
@@ -228,7 +228,7 @@ def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
 
 def _answer(made: "NewArm", arm: "ArmFile", step: str) -> dict[str, Any]:
     from calib.commands.setup.bus_setup import SCHEMA
-    from calib.commissioning.wiring import drive_id
+    from calib.commissioning.drive_match import drive_id
 
     draft = made.draft
     return {

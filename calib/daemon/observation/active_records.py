@@ -113,9 +113,6 @@ class ActiveRecords:
             self._events.say("fault", None, f"{fault}{kept}", {})
         self._store_fault = str(fault)
 
-    def _way_to(self, kinds: list[str]) -> str:
-        return way_to(self._configuration.arm, *kinds, listen_only=self._configuration.listen_only)
-
     def _take_over(self, calibration: CalibrationRecord | None, gravity: GravityRecord | None) -> None:
         """Observe against these records, if they are other ones; raises Refused if they are of another arm."""
         arm = self._configuration.arm
@@ -123,7 +120,8 @@ class ActiveRecords:
             found = {"calibration": calibration, "gravity": gravity}
             missing = [name for name, record in found.items() if record is None]
             of_arm = f"of {arm.name} {arm.serial}"
-            waits = f"waits for a {' and '.join(missing)} record {of_arm}: {self._way_to(missing)}"
+            way = way_to(arm, *missing, listen_only=self._configuration.listen_only)
+            waits = f"waits for a {' and '.join(missing)} record {of_arm}: {way}"
             if waits != self.detail:
                 _LOG.warning(waits)
             self.detail = waits

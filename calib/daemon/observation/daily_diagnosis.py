@@ -16,8 +16,8 @@ from typing import Any
 
 from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration, DiagnosisSettings
+from calib.daemon.state.arm_state import BusiestMinute
 from calib.daemon.state.events import EventLog
-from calib.daemon.state.samples import BusiestMinute
 
 MOST_RECORDINGS = 7
 """Number of diagnosed recordings that are kept to look at: those of a week."""

@@ -5,16 +5,14 @@ from pathlib import Path
 
 from armlink.errors import ArmlinkError, BadInput
 from armlink.loop.messages import Batch
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.stated_model import StatedModel
+from calib.arm.kinematics import StatedModel, gcomp_arm
 from calib.daemon.environment import Environment
 from calib.daemon.observation.observation import ObserverFeed
 from calib.daemon.settings import Configuration
 from calib.daemon.state.events import EventLog, Hub
 from calib.daemon.view import ContactItem, ExternalEvent
 from calib.external.arm_model import ArmRecords
-from calib.external.learned import Learned, load_learned
-from calib.external.live import LiveExternal
+from calib.external.listening import Learned, LiveExternal, load_learned
 from calib.external.tables import event_of, event_text
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.external.contact import EVENT_KINDS, ContactEvent

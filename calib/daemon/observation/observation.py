@@ -110,8 +110,7 @@ def _mean(groups: Array) -> Array:
     there = ~np.isnan(groups)
     count = there.sum(axis=1)
     total = np.where(there, groups, 0.0).sum(axis=1)
-    mean: Array = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return mean
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 class ObserverStorage:

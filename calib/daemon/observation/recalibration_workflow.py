@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 
 from armlink.errors import ArmlinkError, BusFault, Refused
+from armlink.loop.messages import BATCH_SECONDS
 from calib.daemon.environment import BusJobs
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
@@ -25,7 +26,7 @@ Samples = tuple[Array, Array, Array]
 Installed = Callable[[CalibrationRecord, DriftFinding], None]
 
 DAY = 86400.0
-WAITING = 1000
+WAITING = round(100 / BATCH_SECONDS)
 """Batches that wait for an alarm to be explained: 100 s; a cause test takes 40 s (`ObserverConfig.window`)."""
 
 

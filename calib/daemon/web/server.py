@@ -1,27 +1,211 @@
-"""Serves the API and the page on a Unix socket, and on TCP if configured."""
+"""Serves the API and the page on a Unix socket, and on TCP if configured: routes, page, and one format for all errors.
+
+The page is one HTML document with its style and script inside, assembled from `static/` once at the start: it takes a
+single round trip even on a slow network, and no other file of the disk can be requested.
+"""
 
 import asyncio
+import base64
 import contextlib
 import errno
+import hashlib
 import logging
 import os
+import re
 import resource
 import socket as sockets
 import stat
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import uvicorn
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import TypeAdapter
+from starlette.exceptions import HTTPException
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.environment import CLOSING_SECONDS
-from calib.daemon.view import DaemonView
-from calib.daemon.web.app import make_app
-from calib.daemon.web.connection import PATIENCE_SECONDS, protocol_of
-from calib.daemon.web.guard import Access, names_of_host
+from calib.daemon.view import DaemonView, StreamItem
+from calib.daemon.web.connection import PATIENCE_SECONDS, App, protocol_of
+from calib.daemon.web.guard import Access, RequestGuard, names_of_host
+from calib.daemon.web.metrics import metrics_text
+from calib.daemon.web.routes import ERRORS, api_router
+from calib.daemon.web.stream import Streams
 
 log = logging.getLogger(__name__)
+CSP = (
+    "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data:; connect-src 'self';"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Only this script and this style run, by their SHA-256."""
+_IMPORT = re.compile(r'^import .* from "\./(.*)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export ", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class PageFile:
+    content: bytes
+    media_type: str
+    etag: str
+    policy: str
+    """Header content-security-policy."""
+
+
+def page_files() -> dict[str, PageFile]:
+    """URL path → file; there is only `/`."""
+    script, style = joined("page.js"), _static("page.css")
+    icon = base64.b64encode(_static("icon.svg").encode()).decode()
+    page = _static("index.html").replace("ICON", f"data:image/svg+xml;base64,{icon}")
+    page = page.replace("/* STYLE */", style).replace("/* SCRIPT */", script)
+    content = page.encode()
+    policy = CSP.format(script=_hash(script), style=_hash(style))
+    etag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+    return {"/": PageFile(content, "text/html; charset=utf-8", etag, policy)}
+
+
+def joined(name: str) -> str:
+    """A module of `static/` and everything that it imports, each once and before its users, as one module.
+
+    They share one scope: the same top-level name in two of them is an error that the browser reports.
+    """
+    order: list[str] = []
+
+    def visit(module: str) -> None:
+        for other in _IMPORT.findall(_static(module)):
+            visit(other)
+        if module not in order:
+            order.append(module)
+
+    visit(name)
+    return "".join(_EXPORT.sub("", _IMPORT.sub("", _static(module))) for module in order)
+
+
+def _static(name: str) -> str:
+    return files("calib.daemon.web").joinpath("static", name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+TOKEN = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "Needed for TCP only; access to the Unix socket follows from its file mode",
+}
+
+
+class Described(FastAPI):
+    """An application that completes its description on the first request for it, which takes 0.2 s."""
+
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            _complete(super().openapi())
+        return super().openapi()
+
+
+def _complete(schema: dict[str, Any]) -> None:
+    items = TypeAdapter(StreamItem).json_schema(mode="serialization", ref_template="#/components/schemas/{model}")
+    components = schema["components"]
+    for name, definition in items.pop("$defs").items():
+        components["schemas"].setdefault(name, definition)
+    components["schemas"]["StreamItem"] = items
+    components["securitySchemes"] = {"token": TOKEN}
+    schema["security"] = [{}, {"token": []}]
+    events = schema["paths"]["/api/stream"]["get"]["responses"]["200"]["content"]["text/event-stream"]
+    events["schema"] = {"type": "string", "contentMediaType": "application/json", "x-data": _reference("StreamItem")}
+
+
+def _reference(name: str) -> dict[str, str]:
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+PURPOSE = (
+    "This API shows the observed state of an arm, and lets a person approve or reject proposed recalibrations. "
+    "It can command neither torque nor motion."
+)
+
+
+def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Streams]:
+    """The guarded ASGI application on a view, and its streams, to be closed at the end."""
+    streams = Streams(view)
+    files = page_files()
+    app = open_app(view, streams, files)
+    access = replace(access or Access(), open_paths=frozenset(files))
+    return RequestGuard(app, access), streams
+
+
+def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
+    app = Described(
+        title="armlink daemon",
+        description=PURPOSE,
+        version=version("armlink"),
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.include_router(api_router(view, streams, metrics_text(view, streams)))
+    for path, file in files.items():
+        app.add_api_route(path, _sender(file), methods=["GET"], include_in_schema=False)
+    _add_error_handlers(app)
+    return app
+
+
+def _sender(file: PageFile) -> Callable[[Request], Awaitable[Response]]:
+    async def send(request: Request) -> Response:
+        headers = {"etag": file.etag, "cache-control": "no-cache", "content-security-policy": file.policy}
+        if request.headers.get("if-none-match") == file.etag:
+            return Response(status_code=304, headers=headers)
+        return Response(file.content, media_type=file.media_type, headers=headers)
+
+    return send
+
+
+def _add_error_handlers(app: FastAPI) -> None:
+    for kind, status in ERRORS.items():
+        app.add_exception_handler(kind, _as_json(status))
+    app.add_exception_handler(RequestValidationError, _bad_parameter)
+    app.add_exception_handler(HTTPException, _of_http)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _as_json(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
+    async def answer(_: Request, error: Exception) -> Response:
+        return JSONResponse({"error": str(error)}, status)
+
+    return answer
+
+
+async def _bad_parameter(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
+    if first["type"] == "json_invalid":
+        return JSONResponse({"error": "the body is not JSON"}, 422)
+    if first["type"] == "extra_forbidden":
+        return JSONResponse({"error": f"{where[:80]}: there is no parameter of this name"}, 422)
+    given = "" if first["type"] == "missing" else f" (got {str(first.get('input'))[:80]!r})"
+    return JSONResponse({"error": f"{where}: {first['msg'].removeprefix('Value error, ')}{given}"}, 422)
+
+
+async def _of_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    what = {404: f"there is no {request.url.path[:200]}", 405: f"{request.method} is not allowed here"}
+    return JSONResponse({"error": what.get(error.status_code, str(error.detail))}, error.status_code, error.headers)
+
+
+async def _unexpected(request: Request, error: Exception) -> Response:
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return JSONResponse({"error": "internal error; see the log of the daemon"}, 500)
+
+
 SOCKET_MODE = 0o660
 """Access for owner and group only."""
 SHORTEST_TOKEN = 16

@@ -12,7 +12,7 @@ import numpy as np
 
 from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
-from calib.arm.urdf import xml_comment
+from calib.arm.model_files import xml_comment
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import write_changes
 from sim_gap.better_model.export import CorrectedText

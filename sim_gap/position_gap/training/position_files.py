@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from armlink.errors import BadInput
-from calib.arm.urdf import URDF, xml_comment
+from calib.arm.model_files import URDF, xml_comment
 from gcomp.arrays import Array
 from sim_gap.better_model.export import module_path, module_text, write_files
 from sim_gap.better_model.training_files import Row, steps_of, write_entries, write_rows

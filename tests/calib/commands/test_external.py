@@ -14,7 +14,7 @@ from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
-from calib.external.even_samples import averaged_samples
+from calib.external.arm_model import averaged_samples
 from calib.records.records import GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.load import inertial_torque, load_model, place_chain

@@ -14,8 +14,7 @@ from armlink import cli
 from armlink.arm_file import load_arm
 from armlink.recording.files import keeps_names, save_recording
 from armlink.recording.recording import Recording, take_joints
-from calib.arm.kinematics import model_arm
-from calib.arm.stated_model import stated_model
+from calib.arm.kinematics import model_arm, stated_model
 from calib.commands.identify_poses import judged_fit
 from gcomp.arm.load import inertial_torque
 from gcomp.arm.mass_moments import base_parameters

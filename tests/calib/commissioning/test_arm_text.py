@@ -15,9 +15,8 @@ from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry, y
 from armlink.drives.findings import FoundDrive
 from armlink.errors import BadInput
 from calib.commissioning.draft import Draft, JointDraft, arm_text
-from calib.commissioning.drive_match import Match
+from calib.commissioning.drive_match import Match, wired_text
 from calib.commissioning.drive_match import _text as bus_text
-from calib.commissioning.wiring import wired_text
 
 NAMES = [
     "on", "null", "12", "1e3", "2026-01-01", "a, b", "joint: 1", "#1", "Gelenk_ü", "'", '"', "a: {b: [c", "*a", "&a",

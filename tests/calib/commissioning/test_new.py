@@ -335,11 +335,11 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
         joint = int(text[len("joint_")]) - 1
         arm.turn_by_hand(names[joint], (known.upper if "other" in text else known.lower)[joint])
 
-    found = arm_of_bus(
+    text, matches = arm_of_bus(
         FoundNodes(SearchedBus(LockStepBus(arm=arm))), "the bus", {"interface": "x", "channel": "y"}, "mine", ask
     )
-    rows = yaml.safe_load(found.text)["kinematics"]["joints"]
-    assert [match.drive.node for match in found.matches] == [12, 10, 11, 13]
+    rows = yaml.safe_load(text)["kinematics"]["joints"]
+    assert [match.drive.node for match in matches] == [12, 10, 11, 13]
     lower = [row["lower"] for row in rows]
     np.testing.assert_allclose(lower, [-2.5, -1.0, -2.2, -2.9], atol=2e-3)  # the second counts the other way
     assert cli.run(["new", "--bus", "armlink_sim:real.yaml", "--json", "-"]) == 0

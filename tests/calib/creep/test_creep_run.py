@@ -15,8 +15,7 @@ from calib.dataset import load_data
 from calib.fit.creep_fit import fit_creep
 from calib.plan.creep_plan import CreepingArm, check_creep_limits, plan_creep
 from calib.sweep.run import run_sweep
-from calib.sweep.verify import run_verify
-from calib.sweep.weigh import run_weigh
+from calib.sweep.verify import run_verify, run_weigh
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

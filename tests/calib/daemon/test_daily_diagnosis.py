@@ -20,7 +20,7 @@ from calib.daemon.environment import Environment
 from calib.daemon.observation import daily_diagnosis
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
-from calib.daemon.state.samples import BusiestMinute
+from calib.daemon.state.arm_state import BusiestMinute
 
 PATIENCE = 3600.0
 """A process of low priority is given this time on a busy machine [s]."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from armlink.link.types import Stats
 from armlink.loop.messages import CHANNELS, Batch
-from calib.daemon.state.samples import WINDOW_SECONDS, LiveWindow
+from calib.daemon.state.arm_state import WINDOW_SECONDS, LiveWindow
 
 
 def batch(t: float, temperature: float | None = 30.0) -> Batch:

@@ -18,8 +18,8 @@ from armlink.loop.messages import Up
 from calib.daemon.environment import Worker
 from calib.daemon.main_loop import Daemon
 from calib.daemon.settings import DaemonSection, Options
+from calib.daemon.state import arm_state
 from calib.daemon.state import journal as journal_of
-from calib.daemon.state import samples
 from calib.daemon.state.journal import SILENT_SECONDS, Journal
 from calib.daemon.view import EventItem, NotPossible, State
 from calib.records.records import CalibrationRecord, provenance
@@ -210,7 +210,7 @@ def test_a_row_that_the_schema_refuses_holds_no_other_up(tmp_path: Path) -> None
 def test_recordings_that_the_disk_does_not_take_are_left_out_and_begin_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(samples, "MOST_WAITING", 5)
+    monkeypatch.setattr(arm_state, "MOST_WAITING", 5)
     daemon = FastDaemon(tmp_path, 1, DaemonSection.model_validate({"recording": {"rate": 25.0}}))
     daemon.run(2)
     daemon.disk.held = True

@@ -17,7 +17,7 @@ from armlink.recording.recording import Recording
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.field_fit import fit_field
-from calib.fit.slow_windows import rows_of_recording
+from calib.fit.recorded_rows import rows_of_recording
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.mass_moments import payload_columns

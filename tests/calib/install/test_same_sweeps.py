@@ -6,10 +6,9 @@ import pytest
 from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
-from calib.fit import field_fit, heldout
+from calib.fit import field_fit, gravity_fit
 from calib.fit.field_fit import held_out_rows
-from calib.fit.gravity_fit import identify_gravity
-from calib.fit.heldout import held_out_steps
+from calib.fit.gravity_fit import held_out_steps, identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.records.records import HeldOut
 
@@ -33,8 +32,8 @@ def test_a_record_is_not_judged_by_its_own_readings(monkeypatch: pytest.MonkeyPa
         return "errors"
 
     proof = HeldOut(against=record.id)
-    monkeypatch.setattr(heldout, "heldout_scores", scores)
-    monkeypatch.setattr(heldout, "held_out", lambda old, *errors: proof)
+    monkeypatch.setattr(gravity_fit, "heldout_scores", scores)
+    monkeypatch.setattr(gravity_fit, "held_out", lambda old, *errors: proof)
     assert held_out_steps(record, record, arm, data, gravity) == proof
     assert judged == []
     held_out_steps(record, record, arm, others, gravity)

@@ -12,10 +12,9 @@ from synthetic_sweeps import passes
 from armlink.errors import Refused
 from calib.dataset import SweepData
 from calib.fit.field_fit import fit_field, held_out_rows
-from calib.fit.gravity_fit import identify_gravity
-from calib.fit.heldout import held_out_steps, heldout_scores
+from calib.fit.gravity_fit import held_out_steps, heldout_scores, identify_gravity
+from calib.fit.recorded_rows import rows_of_sweeps
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.fit.slow_windows import rows_of_sweeps
 from calib.install.apply import Apply, admit_fitted
 from calib.install.plausibility import check_held_out, replaced_record
 from calib.records.compare import differences

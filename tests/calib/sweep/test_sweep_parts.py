@@ -299,7 +299,9 @@ def swept(folder: Path, mass: float, seconds: int, speed: float | None = None) -
         update={"sweeps": tuple(each.model_copy(update={"speed": speed}) for each in data.plan.sweeps)}
     )
     manifest = Manifest.of(arm, mass)
-    manifest = manifest.model_copy(update={"created": manifest.created.replace(year=2020, second=seconds)})
+    manifest = manifest.model_copy(
+        update={"created": manifest.created.replace(year=2020, hour=0, minute=0, second=seconds)}
+    )
     with DataWriter(folder, manifest) as writer:
         for line in (*data.readings, PlanLine(plan=plan, resolution=(0.0,) * 3)):
             writer.append(line)

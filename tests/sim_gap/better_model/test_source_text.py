@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.arm.urdf import xml_comment
+from calib.arm.model_files import xml_comment
 from sim_gap.better_model.export import module_text
 from sim_gap.better_model.training_files import write_entries
 

@@ -9,7 +9,7 @@ import pytest
 from wrong_arms import THREE, Wrong, model, record
 
 from armlink.errors import BadInput
-from calib.arm.urdf import urdf_of
+from calib.arm.model_files import urdf_of
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.export import write_model
 from sim_gap.model.load import compile_model, urdf_behind

@@ -107,7 +107,7 @@ def test_an_arm_files_model_can_be_written_too(tmp_path):
 def test_a_joint_s_name_does_not_end_a_comment():
     from xml.etree import ElementTree
 
-    from calib.arm.urdf import xml_comment
+    from calib.arm.model_files import xml_comment
 
     comment = xml_comment(["first", "friction of a--->--><body/>: 3", "--"])
     assert [child.tag for child in ElementTree.fromstring(f"<mujoco>{comment}</mujoco>")] == []

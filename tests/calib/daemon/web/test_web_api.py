@@ -16,10 +16,10 @@ from pydantic import TypeAdapter, ValidationError
 from served_page import Served
 
 from calib.daemon.view import HistoryPoint
-from calib.daemon.web import app as page_module
 from calib.daemon.web import history, routes
-from calib.daemon.web.app import page_files
+from calib.daemon.web import server as page_module
 from calib.daemon.web.history import LARGEST_ID, Id
+from calib.daemon.web.server import page_files
 from calib.daemon.web.stream import Streams
 
 
@@ -203,7 +203,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
     """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
     from calib.daemon.view import DaemonView, Decisions
-    from calib.daemon.web.app import open_app
+    from calib.daemon.web.server import open_app
 
     described = server.client().get("/openapi.json").json()["paths"]
     writing = {(path, method) for path, methods in described.items() for method in methods if method != "get"}

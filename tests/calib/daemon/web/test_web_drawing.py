@@ -8,7 +8,7 @@ from playwright.sync_api import Browser, Page, expect
 from scipy.spatial.transform import Rotation
 from served_page import Served, open_page
 
-from calib.daemon.web.app import joined
+from calib.daemon.web.server import joined
 
 
 def test_its_motions_are_rotations_about_axes_in_space(browser: Browser) -> None:

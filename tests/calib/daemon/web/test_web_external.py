@@ -9,12 +9,10 @@ from served_page import served
 
 from armlink.loop.messages import Batch
 from armlink.recording.recording import Recording
-from calib.arm.kinematics import gcomp_arm
-from calib.arm.stated_model import StatedModel
+from calib.arm.kinematics import StatedModel, gcomp_arm
 from calib.daemon.view import ContactItem
 from calib.external.arm_model import ArmRecords, listener_of
-from calib.external.learned import Learned, load_learned, save_learned
-from calib.external.listening import WrenchFrame
+from calib.external.listening import Learned, WrenchFrame, load_learned, save_learned
 
 PUSH = 6.0
 """Of joint 2 [N·m]."""
