@@ -106,17 +106,16 @@ class _Scorer:
 
 
 def order_of_effects(estimate: EffectEstimate, scorer: _Scorer) -> list[CauseStep]:
-    """Effects in the order in which each, added to the earlier ones, lowers the held-out RMS of some joint most, by no
-    more than it makes of the whole fit: what is fitted alone takes the place of what is not there yet."""
+    """Effects in the order in which each, after the earlier ones, lowers some held-out RMS most, its own at most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
         groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
     chosen: list[Term] = []
     before, steps = scorer.rms([]), []
-    own = {effect: scorer.taken(terms) for effect, terms in groups.items()}
+    most = {effect: scorer.taken(terms) for effect, terms in groups.items()}
     while groups:
         outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
-        effect = max(outcomes, key=lambda name: float(np.max(np.minimum(before - outcomes[name], own[name]))))
+        effect = max(outcomes, key=lambda name: float(np.max(np.minimum(before - outcomes[name], most[name]))))
         steps.append(CauseStep(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
         chosen += steps[-1].terms
         before = outcomes[effect]
@@ -164,12 +163,9 @@ def relevant_terms(
         last, first = (scorer.falls(terms, lost, by_row) for terms in kept)
         return np.maximum(last, np.minimum(first, scorer.taken(lost)))
 
-    places = {term.place for term in step.terms}
+    places, small = {term.place for term in step.terms}, set[int]()
     if np.all(rise(places) < least):
         return ()
-    if len(places) == 1:
-        return step.terms
-    small = set[int]()
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):
             small.add(place)
