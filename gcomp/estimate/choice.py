@@ -235,8 +235,8 @@ class LinearTerms:
         change = self.fit(index.tolist())
         left = side - gram[:, index] @ change[index]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
-        own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
-        root = np.linalg.cholesky(own)
+        scaled = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
+        root = np.linalg.cholesky(scaled)
         half = np.linalg.solve(root, scale[:, None] * gram[index])
         adapting = -scale[:, None] * np.linalg.solve(root.T, half)
         out = np.zeros(len(candidates))
