@@ -204,13 +204,18 @@ class LinearTerms:
         return terms
 
     @cached_property
+    def _whole(self) -> tuple[Array, ...]:
+        """Squares of each channel over all folds, (k, k)."""
+        return tuple(squares.sum(0) for squares in self.squares)
+
+    @cached_property
     def _matrix(self) -> tuple[Array, Array]:
         """Normal equations of all parameters and all channels, (K, K) and (K,)."""
         size = len(self.theta)
         gram, side = np.diag(self.prior), np.zeros(size)
         for c, index in enumerate(self.acting):
             if len(index) and self.counts[c].any():
-                gram[index[:, None], index] += self.squares[c].sum(0) / self.variance[c]
+                gram[index[:, None], index] += self._whole[c] / self.variance[c]
                 side[index] -= self.products[c].sum(0) / self.variance[c]
         return gram, side + self.prior * self.expected
 
@@ -222,18 +227,18 @@ class LinearTerms:
         return np.asarray(gram[np.ix_(own, own)] - onto.T @ np.linalg.lstsq(gram[np.ix_(rest, rest)], onto, 1e-12)[0])
 
     def promises(self, free: Iterable[int], candidates: Sequence[tuple[int, ...]]) -> Array:
-        """About how far the cost falls by each group of parameters in addition to free ones, these adapting, (M,)."""
+        """How far the cost of all rows falls by each group of parameters in addition to free ones, which adapt to it by
+        the present weights, (M,)."""
         gram, side = self._matrix
         index = np.array(sorted(free), np.intp)
         floor = 1e-6 * np.diag(gram) + 1e-300
-        if len(index):
-            change = self.fit(index.tolist())[index]
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
-            own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
-            half = np.linalg.solve(np.linalg.cholesky(own), scale[:, None] * gram[index])
-            left = side - gram[:, index] @ change
-        else:
-            half, left = np.zeros((0, len(gram))), side
+        change = self.fit(index.tolist())
+        left = side - gram[:, index] @ change[index]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
+        scaled = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
+        root = np.linalg.cholesky(scaled)
+        half = np.linalg.solve(root, scale[:, None] * gram[index])
+        adapting = -scale[:, None] * np.linalg.solve(root.T, half)
         out = np.zeros(len(candidates))
         widths = np.array([len(each) for each in candidates])
         for width in np.unique(widths):
@@ -249,7 +254,25 @@ class LinearTerms:
             beside = np.where(held, fixed, aim - (blocks @ fixed[..., None])[..., 0])
             free_blocks = np.where(held[:, :, None] | held[:, None, :], np.eye(width), blocks)
             values = np.clip(np.linalg.solve(free_blocks, beside[..., None])[..., 0], low, high)
-            out[same] = np.sum(values * (aim - 0.5 * (blocks @ values[..., None])[..., 0]), axis=1)
+            out[same] = self._falls(change, index, (adapting[:, own] * values).sum(2).T, own, values)
+        return out
+
+    def _falls(self, change: Array, index: Index, moved: Array, own: Index, values: Array) -> Array:
+        """Falls of the cost of all rows from a change (K,) on, by changes of free parameters (p,), (M, p), and of M
+        groups of others, (M, w) each, at these values."""
+        out, before = np.zeros(len(own)), self.left(change).sum(1)
+        for c, place in enumerate(self._places):
+            count = self.counts[c].sum()
+            if not count or not len(self.acting[c]):
+                continue
+            whole, inside, at = self._whole[c], place[index] >= 0, place[own]
+            i, d, x = place[index][inside], moved[:, inside], np.where(at >= 0, values, 0.0)
+            slope = 2.0 * (self.products[c].sum(0) + whole @ change[self.acting[c]])
+            bent = ((whole[at[:, :, None], at[:, None, :]] @ x[..., None])[..., 0] * x).sum(1)
+            bent += (d @ whole[np.ix_(i, i)] * d).sum(1) + 2.0 * ((whole[i][:, at] * x).sum(2).T * d).sum(1)
+            after = np.maximum(before[c] + (slope[at] * x).sum(1) + d @ slope[i] + bent, 0.0)
+            floor = count * self.floor[c] ** 2 + 1e-300
+            out += 0.5 * count * np.log((before[c] + floor) / (after + floor))
         return out
 
     def freedom(self, parameters: Sequence[int]) -> float:

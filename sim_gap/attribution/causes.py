@@ -106,15 +106,16 @@ class _Scorer:
 
 
 def order_of_effects(estimate: EffectEstimate, scorer: _Scorer) -> list[CauseStep]:
-    """Effects in the order in which each, added to the earlier ones, lowers the held-out RMS of some joint most."""
+    """Effects in the order in which each, after the earlier ones, lowers some held-out RMS most, its own at most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
         groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
     chosen: list[Term] = []
     before, steps = scorer.rms([]), []
+    most = {effect: scorer.taken(terms) for effect, terms in groups.items()}
     while groups:
         outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
-        effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
+        effect = max(outcomes, key=lambda name: float(np.max(np.minimum(before - outcomes[name], most[name]))))
         steps.append(CauseStep(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
         chosen += steps[-1].terms
         before = outcomes[effect]
@@ -153,15 +154,7 @@ def relevant_terms(
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
     absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
     least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
-    others = [term for term in estimate.terms if term not in step.terms]
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
-    falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
-    if np.all(np.maximum(*falls) < least):
-        return ()
-    places = {term.place for term in step.terms}
-    if len(places) == 1:
-        return step.terms
-    small = set[int]()
 
     def rise(gone: set[int]) -> Array:
         """RMS lost without the effect there; or that it takes in its place, if a later cause takes that too."""
@@ -170,6 +163,9 @@ def relevant_terms(
         last, first = (scorer.falls(terms, lost, by_row) for terms in kept)
         return np.maximum(last, np.minimum(first, scorer.taken(lost)))
 
+    places, small = {term.place for term in step.terms}, set[int]()
+    if np.all(rise(places) < least):
+        return ()
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):
             small.add(place)

@@ -16,7 +16,7 @@ from sim_gap.residuals.location import Location, locate, row_rms
 from sim_gap.residuals.preprocess import ABSENT, TRIM_S
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import NOMINAL, EffectEstimate
-from sim_gap.search.term import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
+from sim_gap.search.term import BODY, CONSTANT, MASSES, shares_a_factor
 
 WORSE = 1.1
 """Gap with the corrections over the one without them from which the corrections do not carry over; a choice."""
@@ -35,7 +35,7 @@ def notes(
     known = (
         *usual,
         *_at_bounds(estimate, fit),
-        *_common_factor(estimate, fit),
+        *_common_factor(found, estimate, fit),
         *_bound(estimate, fit, judge),
         *_alike(found),
     )
@@ -107,9 +107,9 @@ def _at_bounds(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     )
 
 
-def _common_factor(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
+def _common_factor(found: Sequence[Cause], estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
-    if masses_may_be_constants(fit.layout, estimate.terms):
+    if any(CONSTANT in cause.confounded_with for cause in found if cause.effect in (MASSES, BODY)):
         return (
             f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
             "constants were wrong by one factor, the recordings would look the same; creep sweeps with a weighed mass "

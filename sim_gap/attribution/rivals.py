@@ -12,7 +12,7 @@ from gcomp.estimate.exchange import AS_GOOD as NO_FALL
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import CONSTANT, MASSES, Term, masses_may_be_constants
+from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
 AS_GOOD = 0.036
@@ -36,6 +36,7 @@ SEPARATING_MOTION = {
         {"friction.asymmetric", "torque.offset"}
     ): "record a rest under a known load, and motion in both directions under several loads",
     frozenset({"actuator.gain", "link.mass_moment"}): "record the same poses with a known payload attached",
+    frozenset({"actuator.gain", "link.payload"}): "record the same poses with a known payload attached",
     frozenset({"torque.gain", "link.payload"}): "record the same poses with and without the payload",
     frozenset({"torque.gain", "link.mass_moment"}): "record the same poses with a known payload attached",
     frozenset({"actuator.lag", "actuator.delay"}): "record steps or a chirp up to 10 Hz at a high rate",
@@ -75,13 +76,21 @@ class Rivals:
         present = [term for term in choice.current if term in terms and term.effect == effect]
         outcomes = [self._replaced(term) for term in sorted(present, key=lambda term: (term.place, term.shape))]
         lost, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
-        if effect == MASSES and masses_may_be_constants(choice.equations.layout, choice.current):
-            rivals = [CONSTANT, *rivals]
-        confounded = tuple(dict.fromkeys(rivals))
+        confounded = tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
         if not confounded:
             return Weighed(max(lost, 0.0), (), None)
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
         return Weighed(max(lost, 0.0), confounded, motion)
+
+    def _may_be_constants(self, terms: Sequence[Term]) -> bool:
+        """Whether other constants of all motors, at the price of one effect, explain as much as all masses named."""
+        choice = self.choice
+        masses = [t for t in choice.current if t.effect in (MASSES, "link.inertia", BODY) and not t.bound]
+        if not {*terms} & {*masses} or (layout := choice.equations.layout).sensor:
+            return False
+        drives = [t for t in choice.effects if t.effect == CONSTANT and t not in choice.current]
+        other = [*(t for t in choice.current if t not in masses), *drives]
+        return len(drives) == layout.n and choice.loss(choice.judge(other) - choice.price(drives[1:])) < AS_GOOD
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""

@@ -76,10 +76,3 @@ constant twice as large, the drives report the same."""
 def shares_a_factor(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
     """Whether the terms have torque constants that are known only up to a factor common to them and all masses."""
     return layout.sensor is None and any(term.effect == CONSTANT for term in terms)
-
-
-def masses_may_be_constants(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
-    """Whether mass moments of most links are named, and torque constants all off alike would look the same."""
-    links = {term.place for term in terms if term.effect == MASSES}
-    constants = any(term.effect == CONSTANT for term in terms)
-    return layout.sensor is None and not constants and 2 * len(links) > layout.n

@@ -97,9 +97,9 @@ class TermEquations:
         return out
 
     def price(self, term: Term) -> float:
-        """Price of a term: of its effective coefficients, its shape, and of being rare."""
+        """Price of a term: of its effective coefficients, its shape but for numbers of joints, and of being rare."""
         form = term.form
-        shape = len(term.shape) * (form.hints.linearised_at is None)
+        shape = sum(i not in form.hints.discrete for i in range(len(term.shape))) * (form.hints.linearised_at is None)
         return PRICE * (self.linear.freedom(self.at[term].tolist()) + shape + form.plausibility.prior_penalty)
 
     def log_squares(self, change: Array) -> float:

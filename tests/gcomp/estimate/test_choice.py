@@ -57,9 +57,20 @@ def test_a_candidate_that_would_need_an_impossible_value_promises_nothing() -> N
     random = np.random.default_rng(2)
     x = random.normal(size=(ROWS, 2))
     y = -2.0 * x[:, 0] + x[:, 1]
-    below, above = terms(x, y, 0.0).promises([], [(0,), (1,)])
+    linear = terms(x, y, 0.0)
+    below, above = linear.promises([], [(0,), (1,)])
     assert below == 0.0
-    assert above > 0.3 * float(x[:, 1] @ x[:, 1])
+    before, after = (linear.left(linear.fit(free)).sum() for free in ([], [1]))
+    assert above == pytest.approx(0.5 * linear.counts.sum() * np.log(before / after), rel=1e-3)
+
+
+def test_a_promise_is_the_fall_of_the_cost_with_the_free_parameters_adapting() -> None:
+    random = np.random.default_rng(4)
+    x = random.normal(size=(ROWS, 6)) @ random.normal(size=(6, 6))
+    linear = terms(x, x @ random.normal(size=6) + 0.1 * random.normal(size=ROWS))
+    left = [linear.left(linear.fit([0, 1, *more])).sum() for more in ([], [2], [3, 4])]
+    falls = 0.5 * linear.counts.sum() * np.log(left[0] / np.array(left[1:]))
+    assert linear.promises([0, 1], [(2,), (3, 4)]) == pytest.approx(falls, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -27,10 +27,24 @@ def test_the_effect_that_takes_most_off_any_joint_comes_first() -> None:
     scorer = SimpleNamespace(
         heldout=SimpleNamespace(layout=SimpleNamespace(n=2)),
         rms=lambda terms: np.ones(2) - sum((falls[term] for term in terms), np.zeros(2)),
+        taken=lambda terms: sum((falls[term] for term in terms), np.zeros(2)),
     )
     steps = order_of_effects(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
     assert [step.effect for step in steps] == ["torque.offset", "friction.coulomb"]
     np.testing.assert_allclose(steps[1].before, [0.5, 1.0])
+
+
+def test_what_only_stands_for_another_effect_comes_after_it() -> None:
+    """Alone, the offset takes off what the payload does; beside it, it is next to nothing."""
+    alone = {PAYLOAD: np.array([0.6, 0.4]), OFFSET: np.array([0.7, 0.0])}
+    own = {PAYLOAD: alone[PAYLOAD], OFFSET: np.array([0.02, 0.0])}
+    scorer = SimpleNamespace(
+        heldout=SimpleNamespace(layout=SimpleNamespace(n=2)),
+        rms=lambda terms: np.ones(2) - np.max([np.zeros(2), *(alone[term] for term in terms)], axis=0),
+        taken=lambda terms: sum((own[term] for term in terms), np.zeros(2)),
+    )
+    steps = order_of_effects(SimpleNamespace(terms=(OFFSET, PAYLOAD)), scorer)
+    assert [step.effect for step in steps] == ["link.payload", "torque.offset"]
 
 
 def test_a_remaining_gap_is_noted_with_its_regime_where_one_is_clear(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,9 @@ def test_ur10e(realdata):
     assert np.all(answer.heldout_after <= [3.0, 4.0, 1.6, 0.40, 0.50, 0.35])
     assert np.all(answer.rollout.after < 0.2 * answer.rollout.before)
     assert joints(answer, "link.mass_moment") >= {"joint_3"}
-    assert not joints(answer, "link.payload")
+    # by its data sheet links 4 to 6 of the arm weigh 4.70 kg, those of the model 4.12 kg: a body at the tip may be that
+    masses = [cause.parameters["arm"]["mass"] for cause in answer.causes if cause.effect == "link.payload"]
+    assert all(mass.low < 0.57 < mass.high for mass in masses)
 
 
 @pytest.mark.long
@@ -68,10 +70,14 @@ def test_a_loaded_recording_alone_says_that_the_arm_itself_may_be_heavier(realda
 
 
 @pytest.mark.long
-def test_panda_is_wrong_in_its_masses(realdata):
+def test_panda_lacks_the_hand_of_its_model(realdata):
+    """The model's last link has Franka's hand on it: 0.76 kg, whose centre is 0.138 m along the axis of joint 7."""
     answer = split(realdata / "panda", 0.6)
-    assert answer.causes[0].effect == "link.mass_moment"
-    assert joints(answer, "link.mass_moment") & {"joint_2", "joint_3", "joint_4"}
+    assert answer.causes[0].effect == "link.payload"
+    hand = answer.causes[0].parameters["arm"]
+    assert hand["mass"].value == pytest.approx(-0.76, rel=0.15)
+    assert hand["mass"].low < -0.76 < hand["mass"].high
+    assert hand["z"].low < 0.138 < hand["z"].high
     assert not {joint for c in answer.causes if c.effect.startswith("friction") for joint in c.joints} & {
         "joint_2",
         "joint_3",
