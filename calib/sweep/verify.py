@@ -32,6 +32,8 @@ from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
+DRAWN_FOR_EACH = 10
+"""Poses drawn for each that is wanted, since bodies touch in some."""
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
 tests/calib/drawn_arms.py allows."""
@@ -124,6 +126,11 @@ def run_verify(
     elif at is None:
         at = partial(verify_poses, arm_file, poses, seed)
     held_out = at(mover.position)
+    if not len(held_out):
+        raise Refused(
+            f"{arm_file.name}: according to the model, bodies touch on the way from the present pose to every other: "
+            "move the arm to a free pose, or correct the model's collision shapes"
+        )
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
@@ -199,9 +206,24 @@ def _read_at(mover: Mover, pose: Array, creeping: bool) -> tuple[Array, Array] |
 
 
 def verify_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
-    """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
-    poses = PlannedArm(arm_file).drawn_poses(count, np.random.default_rng([seed, 6]))
-    return poses[nearest_first(poses, begin)]
+    """Random poses (P, n) [rad] within the joint range, in an order with little travel from `begin` (n,).
+
+    At them and on the way from one to the next nothing touches; there are `count` unless the arm reaches fewer.
+    """
+    planned = PlannedArm(arm_file)
+    poses = planned.drawn_poses(DRAWN_FOR_EACH * count, np.random.default_rng([seed, 6]))
+    free = list(poses[planned.free(poses)])
+    left, spare, found, here = free[:count], free[count:], list[Array](), begin
+    while left:
+        nearest = [left[place] for place in nearest_first(np.array(left), here)]
+        reached = next((pose for pose in nearest if planned.is_clear(here, pose)), None)
+        if reached is None:
+            left = [spare.pop()] if spare else []
+            continue
+        left = [pose for pose in left if pose is not reached]
+        found.append(reached)
+        here = reached
+    return np.array(found).reshape(-1, len(begin))
 
 
 def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> Array:

@@ -1,6 +1,7 @@
 """Planning around what stands in the way: an MJCF model with bodies that touch, and what a person is told."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ from bench_arm import along, bench, post
 
 from armlink.cli import run
 from calib.plan.collisions import Collided, Geometry, check_plan, poses_along
+from calib.plan.planned_arm import PlannedArm
 from calib.plan.sweep_plan import plan_sweep
+from calib.sweep.verify import verify_poses
 
 
 def test_a_clear_workspace_is_said_to_be_clear(tmp_path: Path) -> None:
@@ -50,6 +53,16 @@ def test_a_way_that_touches_is_refused_with_bodies_and_pose(tmp_path: Path) -> N
             assert Geometry(arm).free(np.array(scouted)).all()  # a plan of this arm goes by other poses
             return
     pytest.fail("no way of this plan is clear of all its places")
+
+
+def test_verification_goes_around_what_stands_in_the_way(tmp_path: Path) -> None:
+    arm = bench(tmp_path, post(0.3, 0.3))
+    planned, begin = PlannedArm(arm), np.zeros(2)
+    assert planned.free(planned.drawn_poses(300, np.random.default_rng(0))).mean() < 0.95
+    poses = verify_poses(arm, 20, 1, begin)
+    assert len(poses) == 20
+    for here, pose in pairwise([begin, *poses]):
+        assert planned.is_clear(here, pose)
 
 
 def test_the_command_says_it_in_one_line_and_exits_with_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
