@@ -33,7 +33,7 @@ Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
 
-def scout_poses(planned: PlannedArm, seed: int) -> Poses:
+def scout_poses(planned: PlannedArm, seed: int, detours: bool = True) -> Poses:
     """n + 3 poses that determine mass moments and sensor offsets well, in an order with little travel.
 
     Poses in which bodies touch are left out; raises BadInput if too few remain.
@@ -41,7 +41,8 @@ def scout_poses(planned: PlannedArm, seed: int) -> Poses:
     count = planned.arm.n + 3
     poses = planned.free_poses(2 * count, np.random.default_rng(seed))
     middle = np.mean([planned.sweep_range(joint) for joint in range(planned.arm.n)], axis=1)
-    chosen = _informative_poses(planned, poses, gravity_regressor(planned.arm, poses), 10.0, count, middle)
+    columns = gravity_regressor(planned.arm, poses)
+    chosen = _informative_poses(planned, poses, columns, 10.0, count, middle, detours)
     return tuple(tuple(pose.tolist()) for pose in chosen)
 
 
@@ -57,19 +58,20 @@ def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Ar
 
 
 def _informative_poses(
-    planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int, begin: Array
+    planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int, begin: Array, detours: bool = True
 ) -> Array:
     """The poses (count, n) that tell most (D-optimal) of unknowns with these columns (P, n, p) of torque and of every
     joint's offset, in units of `offset` [N·m]; from `begin` (n,) on each is near to the one before.
 
-    Poses on whose way something touches give their place to others, as long as there are any.
+    With `detours`, poses on whose way something touches give their place to others, as long as there are any.
     """
     offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
     rows, left = np.concatenate([columns, offsets], axis=2) / planned.limits.rated[:, None], np.arange(len(poses))
     while True:
         (chosen,) = select([rows[left][None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
         order = left[chosen][nearest_first(poses[left[chosen]], begin)]
-        blocked = [goal for here, goal in pairwise(order) if not planned.is_clear(poses[here], poses[goal])]
+        ways = pairwise(order) if detours else ()
+        blocked = [goal for here, goal in ways if not planned.is_clear(poses[here], poses[goal])]
         left = np.setdiff1d(left, blocked)
         if not blocked or len(left) < count:
             return poses[order]
@@ -216,15 +218,16 @@ def plan_sweep(
     seed: int = 0,
     reference_mass: float = 0.0,
     resolution: Array | None = None,
+    detours: bool = True,
 ) -> SweepPlan:
     """The plan of one pass over all joints, tip to base.
 
     `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing; `resolution` (n,) [rad] that of the
     position readings, if known. Without `guess` nothing is known of the masses and no bias torque is set. With the
     scout's guess, combinations that cannot be held within max_torque are left out, the others get their bias torques,
-    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Combinations on whose way
-    something touches give their place to others, as long as a joint has any. Raises BadInput if a
-    joint's range is too short to sweep or no combination can be held.
+    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. With `detours`, poses and
+    combinations on whose way something touches give their place to others, as long as there are any. Raises BadInput
+    if a joint's range is too short to sweep or no combination can be held.
     """
     planned = PlannedArm(arm_file, guess).require_range()
     section, goal = planned.section, planned.section.gain_std
@@ -234,7 +237,7 @@ def plan_sweep(
     given = reference_mass or section.reference_mass
     masses = [given] if given else reference_masses(planned, reached)
     poses = section.loaded_poses if reference_mass else section.poses
-    scout = scout_poses(planned, seed)
+    scout = scout_poses(planned, seed, detours)
     while True:
         design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
         tried = []
@@ -246,7 +249,7 @@ def plan_sweep(
         else:
             tried = tried[:1]  # none more where those do not suffice
         sweeps, mass, gain_std = tried[-1]
-        blocked = _first_blocked(planned, np.array(scout[-1]), sweeps)
+        blocked = _first_blocked(planned, np.array(scout[-1]), sweeps) if detours else None
         left = options if blocked is None else [_without(each, blocked) for each in options]
         if left is options or not all(each.count for each in left):
             break

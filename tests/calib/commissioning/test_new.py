@@ -73,10 +73,7 @@ def test_a_joint_without_stops_is_not_pressed_on_any(made, tmp_path):
 
 
 def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_touches(tmp_path):
-    """A table as high as the turret's foot is in the way of every sweep; on the floor the arm would sweep beside it."""
-    text = (MODELS / "own.xml").read_text()
-    (tmp_path / "own.xml").write_text(text.replace('size="2 2 0.1"/>', 'size="2 2 0.1" pos="0 0 0.2"/>'))
-    made = new_arm(tmp_path / "own.xml", tmp_path / "own.yaml")
+    made = new_arm(MODELS / "own.xml", tmp_path / "own.yaml")
     assert [joint.name for joint in made.draft.joints] == ["yaw", "pitch", "elbow", "roll"]
     made.write()
     marked = [each for each in comments(made.out) if each.startswith("stops assumed")]
@@ -86,7 +83,7 @@ def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_tou
     poses = np.random.default_rng(5).uniform(limits.lower, limits.upper, (300, limits.n))
     assert geometry.free(poses).mean() > 0.99
     whole = gcomp_arm(
-        parse_arm({"name": "own", "kinematics": {"model": str(tmp_path / "own.xml"), "tip": "wrist"}}, made.out)
+        parse_arm({"name": "own", "kinematics": {"model": str(MODELS / "own.xml"), "tip": "wrist"}}, made.out)
     )
     poses = np.random.default_rng(5).uniform(whole.lower, whole.upper, (300, limits.n))
     assert geometry.free(poses).mean() < 0.9  # the floor is there
