@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from side_by_side import Case, Figure, seconds
 
+from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import diagnose
@@ -136,7 +137,7 @@ def _driven() -> Any:
         spec.delete(old)
     for joint in spec.joints:
         joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-        spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        add_actuator(spec, joint.name, joint.name)
         kinds = mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtObj.mjOBJ_JOINT
         spec.add_sensor(name=f"{joint.name} at", type=kinds[0], objtype=kinds[1], objname=joint.name)
     spec.option.timestep = 1.0 / RATE

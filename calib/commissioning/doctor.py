@@ -20,7 +20,7 @@ from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
 from armlink.loop.open import is_in_process
 from calib.commissioning.draft import assumed_lines
-from calib.commissioning.model_checks import arm_errors, gain_errors, model_findings, motion_findings
+from calib.commissioning.model_checks import model_findings, motion_findings, sweep_errors
 from gcomp.errors import GcompError
 
 INTERFACES = Path("/sys/class/net")
@@ -205,7 +205,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         return
     impossible = list[SetupFinding]()
     try:
-        impossible += arm_errors(arm_file) or gain_errors(arm_file)
+        impossible += sweep_errors(arm_file)
         yield from impossible
         if not impossible:
             yield from model_findings(arm_file)

@@ -48,8 +48,7 @@ def refuse_impossible_model(arm_file: ArmFile) -> None:
 
 def refuse_impossible_sweep(arm_file: ArmFile, reference_mass: float) -> None:
     """Raise BadInput as `refuse_impossible_model`, and where the drives cannot hold a reference mass [kg] in sweeps."""
-    refuse_impossible_model(arm_file)
-    for found in gain_errors(arm_file):
+    for found in sweep_errors(arm_file):
         raise BadInput(str(found))
     if not reference_mass:
         return
@@ -80,6 +79,11 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
         )
         return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
     return []
+
+
+def sweep_errors(arm_file: ArmFile) -> list[SetupFinding]:
+    """Errors of the arm, or of one whose sweeps would tell no torque gain."""
+    return arm_errors(arm_file) or list(gain_errors(arm_file))
 
 
 def gain_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:

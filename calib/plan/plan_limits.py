@@ -27,10 +27,10 @@ Ends = tuple[Array, Array]
 def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of static readings leaves the arm file's limits."""
     planned = PlannedArm(arm_file)
-    limits, ends = planned.limits, np.array([planned.sweep_range(joint) for joint in range(planned.arm.n)]).T
+    limits = planned.limits
     stops = (limits.lower, limits.upper)
     held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
-    require_bounds(arm_file, plan, (ends[0], ends[1]), held, stops)
+    require_bounds(arm_file, plan, planned.ends, held, stops)
     refuse_unfit(arm_file, _of_drives(plan, planned))
 
 

@@ -49,6 +49,12 @@ class PlannedArm:
         margin = self.section.range_margin
         return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
 
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Lower and upper ends of the joints' ways (n,) [rad]."""
+        low, high = np.array([self.sweep_range(joint) for joint in range(self.arm.n)]).T
+        return low, high
+
     def require_range(self) -> Self:
         """This arm; raises BadInput, naming the joint, if a range leaves nothing to sweep."""
         for joint, name in enumerate(self.arm.names):
@@ -64,8 +70,7 @@ class PlannedArm:
 
     def drawn_poses(self, count: int, random: np.random.Generator) -> Array:
         """Poses (count, n) [rad] all over the range that sweeps have."""
-        ends = np.array([self.sweep_range(joint) for joint in range(self.arm.n)])
-        return np.asarray(ends[:, 0] + random.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]))
+        return random.uniform(*self.ends, (count, self.arm.n))
 
     def free_poses(self, fewest: int, random: np.random.Generator) -> Array:
         """Drawn poses (P, n) [rad] in which no bodies touch; raises BadInput if too few remain."""

@@ -40,7 +40,7 @@ def scout_poses(planned: PlannedArm, seed: int, detours: bool = True) -> Poses:
     """
     count = planned.arm.n + 3
     poses = planned.free_poses(2 * count, np.random.default_rng(seed))
-    middle = np.mean([planned.sweep_range(joint) for joint in range(planned.arm.n)], axis=1)
+    middle = np.mean(planned.ends, axis=0)
     columns = gravity_regressor(planned.arm, poses)
     chosen = _informative_poses(planned, poses, columns, 10.0, count, middle, detours)
     return tuple(tuple(pose.tolist()) for pose in chosen)
@@ -240,18 +240,12 @@ def plan_sweep(
     scout = scout_poses(planned, seed, detours)
     while True:
         design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
-        tried = []
-        for more in range(MORE_POSES + 1):
-            sweeps = _choose(planned, design, poses + more)
-            tried.append((sweeps, *_lightest(planned, sweeps, scout, masses, resolution)))
-            if tried[-1][-1] is None or tried[-1][-1] <= FINEST * goal:
-                break
-        else:
-            tried = tried[:1]  # none more where those do not suffice
-        sweeps, mass, gain_std = tried[-1]
+        sweeps, mass, gain_std = _as_exact_as_asked(planned, design, poses, scout, masses, resolution)
         blocked = _first_blocked(planned, np.array(scout[-1]), sweeps) if detours else None
-        left = options if blocked is None else [_without(each, blocked) for each in options]
-        if left is options or not all(each.count for each in left):
+        if blocked is None:
+            break
+        left = [_without(each, blocked) for each in options]
+        if not all(each.count for each in left):
             break
         options = left
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
@@ -291,6 +285,24 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
             f"--reference-mass {mass:g}: with this mass no sweep of {name} stays within max_torque: attach "
             f"at most {float(f'{most[name]:.2g}'):g} kg{unit}"
         )
+
+
+def _as_exact_as_asked(
+    planned: PlannedArm,
+    design: StopDesign,
+    poses: int,
+    scout: Poses,
+    masses: list[float],
+    resolution: Array | None,
+) -> tuple[tuple[Sweep, ...], float, float | None]:
+    """The sweeps, with up to MORE_POSES more a joint where those suffice; mass and worst gain's std as `_lightest`."""
+    tried = []
+    for more in range(MORE_POSES + 1):
+        sweeps = _choose(planned, design, poses + more)
+        tried.append((sweeps, *_lightest(planned, sweeps, scout, masses, resolution)))
+        if tried[-1][-1] is None or tried[-1][-1] <= FINEST * planned.section.gain_std:
+            return tried[-1]
+    return tried[0]
 
 
 def _first_blocked(planned: PlannedArm, here: Array, sweeps: Sequence[Sweep]) -> Sweep | None:

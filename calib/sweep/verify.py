@@ -32,8 +32,6 @@ from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-DRAWN_FOR_EACH = 10
-"""Poses drawn for each that is wanted, since bodies touch in some."""
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
 tests/calib/drawn_arms.py allows."""
@@ -122,9 +120,9 @@ def run_verify(
     mover = Mover(link, section, limits)
     mover.hold_all()
     if at is None and creeping:
-        at = partial(_creep_poses, CreepingArm(arm_file), poses, seed)
+        at = partial(verify_poses, CreepingArm(arm_file), poses, seed, about=CREEP_WAY / 2)
     elif at is None:
-        at = partial(verify_poses, arm_file, poses, seed)
+        at = partial(verify_poses, PlannedArm(arm_file), poses, seed)
     held_out = at(mover.position)
     if not len(held_out):
         raise Refused(
@@ -205,42 +203,23 @@ def _read_at(mover: Mover, pose: Array, creeping: bool) -> tuple[Array, Array] |
     return rest.position, rest.torque
 
 
-def verify_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Array:
-    """Random poses (P, n) [rad] within the joint range, in an order with little travel from `begin` (n,).
+def verify_poses(planned: PlannedArm, count: int, seed: int, begin: Array, about: float = 0.0) -> Array:
+    """Random poses (P, n) [rad] about which, by so much [rad], nothing touches, each reached straight from the one
+    before, the first from `begin` (n,); there are `count` unless the arm reaches fewer.
 
-    At them and on the way from one to the next nothing touches; there are `count` unless the arm reaches fewer.
+    Where the arm file has no geometry they are in an order with little travel.
     """
-    planned = PlannedArm(arm_file)
-    poses = planned.drawn_poses(DRAWN_FOR_EACH * count, np.random.default_rng([seed, 6]))
-    free = list(poses[planned.free(poses)])
-    left, spare, found, here = free[:count], free[count:], list[Array](), begin
-    while left:
-        nearest = [left[place] for place in nearest_first(np.array(left), here)]
-        reached = next((pose for pose in nearest if planned.is_clear(here, pose)), None)
-        if reached is None:
-            left = [spare.pop()] if spare else []
-            continue
-        left = [pose for pose in left if pose is not reached]
-        found.append(reached)
-        here = reached
-    return np.array(found).reshape(-1, len(begin))
-
-
-def _creep_poses(creeping: CreepingArm, count: int, seed: int, begin: Array) -> Array:
-    """Random poses (P, n) [rad] about which nothing touches, each reached straight from the one before."""
-    random = np.random.default_rng([seed, 6])
-    lower, upper = creeping.ends
+    random, (lower, upper) = np.random.default_rng([seed, 6]), planned.ends
     here, found = begin, list[Array]()
     for _ in range(200 * count):
-        pose: Array = random.uniform(lower + CREEP_WAY / 2, upper - CREEP_WAY / 2)
-        if creeping.is_clear(pose - CREEP_WAY / 2, pose + CREEP_WAY / 2) and creeping.is_clear(here, pose):
+        pose: Array = random.uniform(lower + about, upper - about)
+        if planned.is_clear(pose - about, pose + about) and planned.is_clear(here, pose):
             found.append(pose)
             here = pose
             if len(found) == count:
                 break
-    if creeping.geometry is None and found:
-        return np.array(found)[nearest_first(np.array(found), begin)]
-    return np.array(found)
+    poses = np.array(found)
+    return poses[nearest_first(poses, begin)] if planned.geometry is None and found else poses
 
 
 def _creep(mover: Mover, way: float) -> list[Sample]:

@@ -158,8 +158,8 @@ def stuck_intervals(time: Array, model: Array, held: Mask, t: Array, reading: Ar
     changes = np.flatnonzero(np.diff(reading) != 0.0)
     starts, ends = np.r_[0, changes + 1], np.r_[changes, len(reading) - 1]
     out = []
-    steps = np.abs(np.diff(np.unique(reading)))
-    least = max(MOVED * float(np.ptp(model)), STEPS * float(steps.min(initial=np.inf)) if len(steps) else 0.0)
+    steps = np.diff(np.unique(reading))
+    least = max(MOVED * float(np.ptp(model)), STEPS * float(steps.min()) if len(steps) else 0.0)
     long = t[ends] - t[starts] >= LONGEST_STUCK_S
     for a, b in zip(starts[long].tolist(), ends[long].tolist(), strict=True):
         natural = len(changes) > 0 and (reading[a] == 0.0 or abs(reading[a]) >= np.abs(reading).max())

@@ -59,7 +59,7 @@ def test_verification_goes_around_what_stands_in_the_way(tmp_path: Path) -> None
     arm = bench(tmp_path, post(0.3, 0.3))
     planned, begin = PlannedArm(arm), np.zeros(2)
     assert planned.free(planned.drawn_poses(300, np.random.default_rng(0))).mean() < 0.95
-    poses = verify_poses(arm, 20, 1, begin)
+    poses = verify_poses(planned, 20, 1, begin)
     assert len(poses) == 20
     for here, pose in pairwise([begin, *poses]):
         assert planned.is_clear(here, pose)
