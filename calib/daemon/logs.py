@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from typing import TextIO
 
 from armlink.content.printable_text import printable_json, printable_text
-from calib.daemon.environment import CLOSING_SECONDS, Rate, RateLimit
+from calib.daemon.environment import CLOSING_SECONDS
+from calib.daemon.rate_limit import Rate, RateLimit
 
 MOST_LINES = 10_000
 """Lines that wait for a reader of stderr that takes none; further ones are dropped."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.rests import known
+from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns

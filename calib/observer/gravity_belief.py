@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.observer.discrepancy import DiscrepancyLevel, Kernel, Posterior, Reference, Rows
-from calib.observer.rests import restored
+from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array

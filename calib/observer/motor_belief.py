@@ -19,7 +19,7 @@ import numpy as np
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
 from calib.motion.static_reading import LEAST_SAMPLES, slope
 from calib.observer.config import LONGEST_GAP
-from calib.observer.rests import known
+from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque, Parameter
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array

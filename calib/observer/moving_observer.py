@@ -22,7 +22,7 @@ from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_
 from calib.observer.decision import AGREEMENT, DriftFinding, Event, verdict_evidence
 from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.motor_belief import MotorBelief, Passage, PassageDetector
-from calib.observer.rests import UNREADABLE
+from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm

@@ -19,7 +19,8 @@ from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed, may_adapt
 from calib.observer.moving_observer import MovingObserver
-from calib.observer.rests import UNREADABLE, RestDetector, restored
+from calib.observer.rest_detector import RestDetector
+from calib.observer.saved_values import UNREADABLE, restored
 from calib.observer.tracking import Estimate, Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm

@@ -20,7 +20,7 @@ from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
-from calib.observer.rests import RestDetector
+from calib.observer.rest_detector import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arrays import Array

@@ -16,7 +16,7 @@ from calib.observer.cause_test import CauseTest, DetectionLimits, limits
 from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.rests import read_rows, restored, save_rows
+from calib.observer.saved_values import read_rows, restored, save_rows
 from gcomp.arrays import Array, as_array
 from gcomp.identify.readings import StaticReadings
 

@@ -31,7 +31,7 @@ from served_page import TOKEN, Served, served
 from small_arm import small_arm
 from test_web_schema import SETTINGS, check_all
 
-from calib.daemon.environment import RateLimit
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web import connection
 from calib.observer.decision import DriftFinding

@@ -30,7 +30,7 @@ from fuzz_kinds import KINDS, ROOT, Seed
 from fuzzing import FAMILIES, known_frames, spoilt, take_in
 from served_page import served
 
-from calib.daemon.environment import RateLimit
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.web import connection
 
 CORPUS = Path(__file__).parents[1] / "faults" / "corpus"

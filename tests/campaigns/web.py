@@ -198,7 +198,7 @@ def requests(examples: int) -> dict[str, Any]:
     from served_page import served
     from test_web_schema import SETTINGS, check_all
 
-    from calib.daemon.environment import RateLimit
+    from calib.daemon.rate_limit import RateLimit
 
     RateLimit.take = lambda *_: 0.0  # type: ignore[method-assign, assignment]
     view = MadeUpView()

@@ -18,7 +18,7 @@ from fuzz_kinds import KINDS, path_to_give
 from fuzzing import command_too_much, take_in
 from served_page import served
 
-from calib.daemon.environment import RateLimit
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.web import connection
 
 CORPUS = Path(__file__).parent / "corpus"

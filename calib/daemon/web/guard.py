@@ -16,7 +16,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
-from calib.daemon.environment import Rate, RateLimit
+from calib.daemon.rate_limit import Rate, RateLimit
 from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of, until_gone
 
 BODY_LIMIT = 4096

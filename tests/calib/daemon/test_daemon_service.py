@@ -18,9 +18,9 @@ from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from armlink.loop.messages import Down, Up
 from armlink.recording.files import load_recording
-from calib.daemon.environment import Rate
 from calib.daemon.logs import JsonFormatter, LineLimit
 from calib.daemon.main_loop import Notifier, watchdog_seconds
+from calib.daemon.rate_limit import Rate
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import HistoryPoint, NoSuch, NotPossible, State

@@ -8,7 +8,7 @@ from rest_arm import RestArm
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import INITIAL_GAIN_STD, ObserverConfig
-from calib.observer.rests import RestDetector
+from calib.observer.rest_detector import RestDetector
 from calib.observer.tracking import Cusum, SensorFilter
 from gcomp.gravity.torque import gravity_torque
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.observer.config import LONGEST_WINDOW
-from calib.observer.rests import UNREADABLE, restored
+from calib.observer.saved_values import UNREADABLE, restored
 from calib.observer.tracking import PLACE_MEMORY, PLACE_SIZE, PoseMemory
 
 HERE = np.array([0.3, -1.0])

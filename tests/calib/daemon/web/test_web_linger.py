@@ -12,7 +12,8 @@ import pytest
 from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
-from calib.daemon.environment import CLOSING_SECONDS, RateLimit
+from calib.daemon.environment import CLOSING_SECONDS
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import server as server_module
 from calib.daemon.web.connection import PEER, Peer

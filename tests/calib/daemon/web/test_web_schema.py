@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
-from calib.daemon.environment import RateLimit
+from calib.daemon.rate_limit import RateLimit
 from calib.daemon.service_view import ServiceView
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
 from armlink.errors import BadInput
-from calib.daemon.environment import MOST_KEYS, Rate, RateLimit
+from calib.daemon.rate_limit import MOST_KEYS, Rate, RateLimit
 from calib.daemon.web import connection as connection_module
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web.connection import PEER, Peer

@@ -1,64 +1,13 @@
-"""Rest detection: turns samples into rows, one averaged row per stop of the arm; and how rows and all else are saved.
+"""Rest detection: turns samples into rows, one averaged row per stop of the arm."""
 
-Saved are JSON values, read back whole or not at all. Every part of the observer has `save() -> dict` and
-`restore(values)`, which raises one of UNREADABLE where the values do not fit: the observer restores copies of its
-parts, and keeps them if all fit. Times are not saved, because clocks restart with the machine.
-"""
-
-from copy import copy
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import LONGEST_GAP, ObserverConfig
+from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
-
-UNREADABLE = (LookupError, TypeError, ValueError, OverflowError)
-"""Raised while values are read that are missing, of another type or of another shape (BadArray is a ValueError)."""
-
-
-class _Saved(Protocol):
-    def restore(self, values: dict[str, Any]) -> None: ...
-
-
-Part = TypeVar("Part", bound=_Saved)
-
-
-def restored(part: Part, values: dict[str, Any]) -> Part:
-    """A copy of a part that continues from saved values; raises one of UNREADABLE."""
-    made = copy(part)
-    made.restore(values)
-    return made
-
-
-def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
-    """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
-    told = ([known(row.temperature)] if np.isfinite(row.temperature).any() else [] for row in rows)
-    return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *warm]
-        for row, warm in zip(rows, told, strict=True)
-    ]
-
-
-def read_rows(values: Any, n: int) -> list[StaticReading]:
-    """The rows of n joints that `save_rows` wrote; raises one of UNREADABLE."""
-    return [_row(n, *row) for row in values]
-
-
-def _row(n: int, t: Any, position: Any, torque: Any, direction: Any, temperature: Any = None) -> StaticReading:
-    position, torque, direction = (as_array("row", column, (n,)) for column in (position, torque, direction))
-    untold = np.full(n, np.nan)
-    told = as_array("row", untold if temperature is None else temperature, (n,), finite=False)
-    return StaticReading.of(float(t), position, torque, direction, temperature=told)
-
-
-def known(values: Array) -> Any:
-    """An array as JSON values, null for NaN; `as_array` reads it back."""
-    kept = values.astype(object)
-    kept[np.isnan(values)] = None
-    return kept.tolist()
-
 
 NEW_POSE = 0.05
 """A stop counts as another one once some joint has moved this far [rad]: a long rest is one row."""
