@@ -61,6 +61,8 @@ class Environment:
     """For bus and record store."""
     port: BusAccess
     disk: Disk
+    aside: RunAside
+    """For work that takes seconds and can be pickled."""
 
 
 class BusJobs:

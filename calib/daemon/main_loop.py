@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
@@ -25,12 +26,15 @@ from armlink.loop.kept_arm import KeptArm
 from armlink.loop.messages import BATCH_SECONDS, Down, LoopAnswer, Told
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
+from calib.daemon.aside import in_process
 from calib.daemon.environment import CLOSING_SECONDS, Environment, Worker
 from calib.daemon.logs import log_in_thread
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection, Options
 from calib.records.store import RecordStore
+
+T = TypeVar("T")
 
 
 class Notifier:
@@ -102,7 +106,10 @@ class Daemon:
         port = _CurrentProcess(lambda: self.process)
         self._disk = Worker(self._loop, "disk")
         self._store, self._records_and_bus = RecordStore(options.store), Worker(self._loop, "records and bus")
-        environment = Environment(time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk)
+        self._calculations = Worker(self._loop, "calculations")
+        environment = Environment(
+            time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk, self._aside
+        )
         settings = options.settings(arm)
         self.service = Service(arm, settings, options.listen_only, state, self._store, environment)
         self.view = ServiceView(self.service)
@@ -112,6 +119,9 @@ class Daemon:
         self._presses = Presses()
         self._bus_ends, self._replacing = Worker(self._loop, "end of the bus process"), False
         """Waits for a bus process that brings its arm to the end; whether another one is to take its place."""
+
+    def _aside(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
+        self._calculations(lambda: in_process(work), done)
 
     async def run(self) -> None:
         """Run until SIGTERM, SIGINT or SIGQUIT; then the arm comes to its end (`armlink.link.ends`), however long that

@@ -12,7 +12,7 @@ Each part holds its own state and calls only parts further down:
     EventLog               events to the journal, the stream's Hub and the process's log
     Journal                what waits for the disk, and the file; Configuration and Environment are given
 
-What touches a disk, a database or the bus goes to the two threads of Environment.
+What touches a disk, a database or the bus, or takes long, goes aside by way of Environment.
 """
 
 import logging

@@ -5,7 +5,7 @@ And ordinary work for a simulated arm: endless random waypoints inside the joint
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import cycle
 
 import numpy as np
 
@@ -65,31 +65,25 @@ class WorkMotion:
     """Rest at each waypoint [s]: settling and average of the rest detection, and a little more."""
 
 
-TOUR = WorkMotion(reach=10.0)
-"""A tour's moves may span the whole range of a joint [rad]."""
-
-
 @dataclass(eq=False)
-class RandomMotion:
-    """A `Controller`: a tour of poses over the whole range, then ordinary work or rest."""
+class PoseWalk:
+    """A `Controller`: a tour of poses, then work, to and fro along its poses without end, or rest."""
 
     start: Array
     """Where the arm is held (n,) [rad]."""
-    lower: Array
-    upper: Array
+    tour: Array
+    """(P, n) [rad]; may be empty."""
+    work: Array
+    """(W, n) [rad]; may be empty."""
     max_velocity: Array
     period: float
-    seed: int
-    poses: int
-    """Of the tour; 0: none."""
-    work: bool
     done: int = 0
     _targets: Iterator[Array] | None = None
 
     @property
     def progress(self) -> tuple[int, int] | None:
         """Poses done and in all; None where there is no tour."""
-        return (self.done, self.poses) if self.poses else None
+        return (self.done, len(self.tour)) if len(self.tour) else None
 
     def command(self, sample: Sample) -> Command:
         if self._targets is None:
@@ -97,20 +91,15 @@ class RandomMotion:
         return Command.hold(next(self._targets))
 
     def _motion(self) -> Iterator[Array]:
-        here = self.start
-        if self.poses:
-            for piece in islice(self._pieces(here, TOUR), self.poses):
-                yield from piece
-                self.done, here = self.done + 1, piece[-1]
-        if self.work:
-            for piece in self._pieces(here, WorkMotion()):
-                yield from piece
+        here, motion = self.start, WorkMotion()
+        for pose in self.tour:
+            yield from way_and_rest(here, pose, self.max_velocity, self.period, motion)
+            self.done, here = self.done + 1, pose
+        for pose in cycle([*self.work, *self.work[-2:0:-1]]):
+            yield from way_and_rest(here, pose, self.max_velocity, self.period, motion)
+            here = pose
         while True:
             yield here
-
-    def _pieces(self, here: Array, motion: WorkMotion) -> Iterator[Array]:
-        random = np.random.default_rng([self.seed, 8])
-        return work_pieces(here, self.lower, self.upper, self.max_velocity, self.period, random, motion)
 
 
 def work_targets(
@@ -148,7 +137,12 @@ def work_pieces(
             np.minimum(middle + half, here + motion.reach),
         )
         goal = random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
-        speed, acceleration = motion.speed_share * max_velocity, np.full_like(here, motion.acceleration)
-        way = trajectory(here, goal, speed, acceleration, period)
-        yield np.vstack([way, np.repeat(goal[None], round(motion.rest / period), axis=0)])
+        yield way_and_rest(here, goal, max_velocity, period, motion)
         here = goal
+
+
+def way_and_rest(here: Array, goal: Array, max_velocity: Array, period: float, motion: WorkMotion) -> Array:
+    """Position targets (K, n) [rad] of the way to a pose (n,) and the rest there."""
+    speed, acceleration = motion.speed_share * max_velocity, np.full_like(here, motion.acceleration)
+    way = trajectory(here, goal, speed, acceleration, period)
+    return np.vstack([way, np.repeat(goal[None], round(motion.rest / period), axis=0)])

@@ -24,6 +24,8 @@ SLOWEST = 0.3
 FASTEST = 2.0
 """Largest acceleration between sweeps, and between poses of a verification [rad/s²]; a choice, swept in
 tests/campaigns/random_arms.py."""
+TRIES = 200
+"""Random poses that are tried for each one that is wanted."""
 
 
 class PlannedArm:
@@ -87,6 +89,24 @@ class PlannedArm:
     def is_clear(self, begin: Array, end: Array) -> bool:
         """Whether nothing touches on the straight way between two poses (n,) [rad]."""
         return bool(self.free(straight_way(begin, end)).all())
+
+    def reachable_poses(
+        self, count: int, random: np.random.Generator, begin: Array, reach: float = np.inf, about: float = 0.0
+    ) -> Array:
+        """Random poses (P, n) [rad] about which, by so much [rad], nothing touches, each reached straight from the one
+        before, the first from `begin` (n,), no joint moving more than `reach` [rad]; there are `count` unless the arm
+        reaches fewer."""
+        lower, upper = self.ends
+        here, found = begin, list[Array]()
+        for _ in range(TRIES * count):
+            if len(found) == count:
+                break
+            pose: Array = random.uniform(*np.clip([here - reach, here + reach], lower + about, upper - about))
+            around = np.unique(straight_way(pose - about, pose + about), axis=0)
+            if self.free(around).all() and self.is_clear(here, pose):
+                found.append(pose)
+                here = pose
+        return np.array(found).reshape(-1, self.arm.n)
 
     # ---- torques, by the rough gravity model
 

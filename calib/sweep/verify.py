@@ -209,17 +209,8 @@ def verify_poses(planned: PlannedArm, count: int, seed: int, begin: Array, about
 
     Where the arm file has no geometry they are in an order with little travel.
     """
-    random, (lower, upper) = np.random.default_rng([seed, 6]), planned.ends
-    here, found = begin, list[Array]()
-    for _ in range(200 * count):
-        pose: Array = random.uniform(lower + about, upper - about)
-        if planned.is_clear(pose - about, pose + about) and planned.is_clear(here, pose):
-            found.append(pose)
-            here = pose
-            if len(found) == count:
-                break
-    poses = np.array(found)
-    return poses[nearest_first(poses, begin)] if planned.geometry is None and found else poses
+    poses = planned.reachable_poses(count, np.random.default_rng([seed, 6]), begin, about=about)
+    return poses[nearest_first(poses, begin)] if planned.geometry is None else poses
 
 
 def _creep(mover: Mover, way: float) -> list[Sample]:

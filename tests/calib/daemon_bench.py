@@ -129,7 +129,7 @@ class DaemonBench:
     def start(self) -> None:
         """A service as the command starts it, on what the directory holds."""
         self.host = InlineLoop(self.arm, self._open)
-        environment = Environment(self.now, self.wall, Immediate(), self.host, Immediate())
+        environment = Environment(self.now, self.wall, Immediate(), self.host, Immediate(), Immediate())
         settings = self.settings.model_copy(update={"work": self.work})
         self.service = Service(self.arm, settings, False, self.directory / "state", self.store, environment)
         self.view = ServiceView(self.service)

@@ -107,7 +107,9 @@ class FastDaemon:
         return CalibrationRecord(**provenance(self.arm, created=START), joints=joints), gravity
 
     def start(self, up: bool = True) -> None:
-        environment = Environment(self.now, self.wall, lambda work, done: self.run_aside(work, done), self, self.disk)
+        environment = Environment(
+            self.now, self.wall, lambda work, done: self.run_aside(work, done), self, self.disk, Immediate()
+        )
         state = self.directory / "state"
         self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, environment)
         self.view = ServiceView(self.service)
@@ -143,7 +145,7 @@ class FastDaemon:
         return self.read_calibration(joint)
 
     def move(self, controller: Controller) -> None:
-        self.tour(controller.poses)
+        self.tour(len(controller.tour))
 
     def tour(self, poses: int) -> None:
         self.touring, self.job_after, self.fast.job = poses, self.fast.job, None

@@ -107,7 +107,7 @@ def test_by_the_daemon(folder: Path) -> None:
     events, nothing = Events(), None
     daily = DailyDiagnosis(
         Configuration(load_arm("sarcos"), settings, listen_only=True),
-        Environment(lambda: (now[0] - START).total_seconds(), lambda: now[0], at_once, nothing, at_once),  # type: ignore[arg-type]
+        Environment(lambda: (now[0] - START).total_seconds(), lambda: now[0], at_once, nothing, at_once, at_once),  # type: ignore[arg-type]
         events,  # type: ignore[arg-type]
         WornMinute(),  # type: ignore[arg-type]
         folder,

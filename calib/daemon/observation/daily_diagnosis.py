@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from calib.daemon.aside import NICE
 from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration, DiagnosisSettings
 from calib.daemon.state.arm_state import BusiestMinute
@@ -29,8 +30,8 @@ STAMP = "%Y%m%dT%H%M%SZ"
 """Names of the recordings."""
 UNFINISHED, WRITTEN = "unfinished", object()
 """Name of the recording while it is written; the sign that it is whole."""
-NICE, FIRST_TO_KILL = 10, "1000"
-"""Niceness and oom_score_adj of the process."""
+FIRST_TO_KILL = "1000"
+"""The process's oom_score_adj."""
 
 
 class DailyDiagnosis:

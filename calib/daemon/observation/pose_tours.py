@@ -1,21 +1,24 @@
 """Motion of an arm that the daemon drives: tours of poses over the joints' whole range, and ordinary work.
 
 A tour is made by schedule, on request, or if watching cannot decide; it has as many poses as the observer's longest
-window.
+window. Poses are chosen by a process of its own, by the shapes of the arm file's model, before anything moves.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
+from armlink.errors import ArmlinkError, Refused
 from armlink.loop.messages import Batch, Progress
-from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration
 from calib.daemon.state.events import EventLog
 from calib.daemon.view import State
-from calib.motion.trajectory import RandomMotion
+from calib.motion.trajectory import PoseWalk, WorkMotion
 from calib.observer.config import LONGEST_WINDOW
+from calib.plan.planned_arm import PlannedArm
 from gcomp.arrays import Array
 
 TOUR_INTERVAL = 3600.0
@@ -32,22 +35,28 @@ class PoseTours:
         self._configuration, self._events, self._environment = configuration, events, environment
         self._state = state
         self._last = -float("inf")
-        self._seed = int(environment.wall().timestamp())
         self._here: Array | None = None
         """Newest target positions (n,) [rad]; None until there are some since the bus is open."""
+        self._choice = 0
+        """Number of the newest choice of poses; an older one comes too late."""
         self.progress: Progress | None = None
-        """Of the tour under way."""
+        """Of the tour under way, its choice of poses included."""
+
+    @property
+    def _works(self) -> bool:
+        return self._configuration.settings.work and not self._configuration.listen_only
 
     def request(self, why: str) -> None:
         """Begin a tour, so that the observer gets enough poses."""
         state = self._state()
-        if self._configuration.listen_only or state is not State.OBSERVING:
+        if self._configuration.listen_only or state is not State.OBSERVING or self._here is None:
             reason = "the daemon only listens" if self._configuration.listen_only else f"the daemon is {state}"
             self._events.say("refused", None, f"the sweep ({why}) was not begun: {reason}", {})
             return
         self.progress, self._last = Progress(0, LONGEST_WINDOW), self._environment.monotonic()
-        self._events.say("sweep", None, f"sweeping {LONGEST_WINDOW} poses: {why}", {"poses": LONGEST_WINDOW})
-        self._move(LONGEST_WINDOW, int(self._last))
+        nowhere = np.empty((0, len(self._here)))
+        self._walk(self._here, nowhere, nowhere)  # the arm rests until poses are chosen
+        self._choose(self._here, LONGEST_WINDOW, f"the sweep ({why})")
 
     def up(self) -> None:
         self._here = None
@@ -55,17 +64,41 @@ class PoseTours:
     def heard(self, batch: Batch) -> None:
         """Note where the arm is, and begin to work where it is to and the bus has been opened."""
         begins, self._here = self._here is None, batch.channels["position_command"][-1]
-        if begins and self._configuration.settings.work and not self._configuration.listen_only:
-            self._move(0, self._seed)
+        if begins and self._works:
+            self._choose(self._here, 0, "work")
 
-    def _move(self, poses: int, seed: int) -> None:
-        arm, section = gcomp_arm(self._configuration.arm), self._configuration.arm.require_link()
+    def _choose(self, here: Array, poses: int, what: str) -> None:
+        """Choose poses beside the service, then move, unless something else has been asked for meanwhile."""
+        self._choice += 1
+        number, seed = self._choice, int(self._environment.wall().timestamp())
+
+        def chosen(outcome: tuple[Array, Array] | Exception) -> None:
+            if number == self._choice:
+                self._chosen(outcome, here, poses, what)
+
+        arm = self._configuration.arm
+        work = 3 * LONGEST_WINDOW if self._works else 0  # to and fro, beyond what the observer remembers
+        self._environment.aside(partial(chosen_poses, arm, here, poses, work, seed), chosen)
+
+    def _chosen(self, outcome: tuple[Array, Array] | Exception, here: Array, poses: int, what: str) -> None:
+        if isinstance(outcome, ArmlinkError):
+            self.progress = None
+            self._events.say("refused", None, f"{what} was not begun: {outcome}", {})
+        elif isinstance(outcome, Exception):
+            raise outcome
+        elif self._here is not None and not np.array_equal(self._here, here):  # it had not come to rest
+            self._choose(self._here, poses, what)
+        else:
+            tour, work = outcome
+            if poses:
+                self.progress = Progress(0, len(tour))
+                self._events.say("sweep", None, f"{what}: {len(tour)} poses", {"poses": len(tour)})
+            self._walk(here, tour, work)
+
+    def _walk(self, here: Array, tour: Array, work: Array) -> None:
+        section = self._configuration.arm.require_link()
         speed = np.array([joint.max_velocity for joint in section.joints])
-        here = self._here if self._here is not None else np.full(arm.n, np.nan)
-        work = self._configuration.settings.work
-        self._environment.port.move(
-            RandomMotion(here, arm.lower, arm.upper, speed, 1.0 / section.rate, seed, poses, work)
-        )
+        self._environment.port.move(PoseWalk(here, tour, work, speed, 1.0 / section.rate))
 
     def wish(self, why: str) -> None:
         """Begin a tour if the configuration lets the daemon decide on one."""
@@ -97,3 +130,22 @@ class PoseTours:
 
     def stopped(self) -> None:
         self.progress = None
+        self._choice += 1
+
+
+def chosen_poses(arm_file: ArmFile, here: Array, poses: int, work: int, seed: int) -> tuple[Array, Array]:
+    """Poses of a tour (P, n) from `here` (n,), and of work from its end (W, n) [rad]; nothing touches on their ways.
+
+    There are `poses` and `work` of them unless the arm reaches fewer. Raises Refused where it reaches none, BadInput.
+    """
+    planned, random = PlannedArm(arm_file), np.random.default_rng([seed, 8])
+    tour = planned.reachable_poses(poses, random, here)
+    at_work = planned.reachable_poses(work, random, tour[-1] if len(tour) else here, reach=WorkMotion.reach)
+    if len(tour) < min(poses, 1) or len(at_work) < min(work, 1):
+        touching = planned.geometry.contacts(here) if planned.geometry is not None else []
+        bodies = " and ".join(touching[0].bodies) if touching else "none at its pose"
+        raise Refused(
+            "from where the arm is, no pose is reached without a collision of the model's shapes (touching now: "
+            f"{bodies}): move the arm clear, or correct the shapes"
+        )
+    return tour, at_work

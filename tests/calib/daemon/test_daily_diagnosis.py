@@ -36,7 +36,12 @@ class Bench:
         nothing: Any = None
         begun, self.set_by = self.time, timedelta()
         environment = Environment(
-            lambda: (self.time - begun).total_seconds(), lambda: self.time + self.set_by, nothing, nothing, Immediate()
+            lambda: (self.time - begun).total_seconds(),
+            lambda: self.time + self.set_by,
+            nothing,
+            nothing,
+            Immediate(),
+            nothing,
         )
         self.busiest, self.joints, self.now = BusiestMinute(250.0), len(configuration.names), 0.0
         self.daily = DailyDiagnosis(configuration, environment, self, self.busiest, directory)  # type: ignore[arg-type]
