@@ -225,7 +225,7 @@ def _tell(console: Any, answer: dict[str, Any], names: tuple[str, ...]) -> None:
         "joint", "external torque, RMS [N·m]", "95 % bound ± [N·m]", "at rest ± [N·m]", title=answer["recording"]
     )
     for name, rms, bound, rest in zip(names, answer["rms"], answer["bound"], answer["bound_at_rest"], strict=True):
-        table.add_row(name, *("–" if x is None else f"{x:.3f}" for x in (rms, bound, rest)))
+        table.add_row(name, *("–" if x is None else f"{x:.3g}" for x in (rms, bound, rest)))
     console.print(table)
     best, worst = ("not determined" if force is None else f"{force:.1f} N" for force in answer["smallest_force"])
     console.print(

@@ -115,7 +115,7 @@ def _show(result: "Verification", console: "PlainConsole") -> None:
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
     for name, *torques in zip(result.names, result.rms, result.max_error, result.tolerance, strict=True):
-        table.add_row(name, *(f"{torque:.3f}" for torque in torques))
+        table.add_row(name, *(f"{torque:.3g}" for torque in torques))
     console.print(table)
     beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
     agree = "passed: at every joint the RMS difference between model and sensor is within the limit"

@@ -104,7 +104,7 @@ def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
     """As the paper's Figure 6: torque (K, n) [N·m] over the number of the reading; NaN is left out."""
     error = sensor - model
     return _panels(
-        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(names, rms(error), strict=True)],
+        [f"{name}, RMS {value:.3g} N·m" for name, value in zip(names, rms(error), strict=True)],
         [(model[keep, j], sensor[keep, j]) for j, keep in enumerate(np.isfinite(error.T))],
         "number of the reading",
     )
@@ -113,7 +113,7 @@ def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
 def verify_figure(check: Verification) -> Any:
     """The paper's Figure 6: torque over pose number, model solid, sensor dashed, one panel per joint."""
     return _panels(
-        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(check.names, check.rms, strict=True)],
+        [f"{name}, RMS {value:.3g} N·m" for name, value in zip(check.names, check.rms, strict=True)],
         [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],
         "pose number",
     )

@@ -169,8 +169,8 @@ def creep_complaint(
         return None
     worst = int(np.argmax(found.rms / found.tolerance))
     return (
-        f"{found.names[worst]}: in the check motion the RMS difference to the model is {found.rms[worst]:.3f} N·m, "
-        f"allowed {found.tolerance[worst]:.3f} N·m"
+        f"{found.names[worst]}: in the check motion the RMS difference to the model is {found.rms[worst]:.3g} N·m, "
+        f"allowed {found.tolerance[worst]:.3g} N·m"
     )
 
 
