@@ -26,14 +26,15 @@ def _contradictions(rounds: Sequence[Mapping[str, Any]]) -> str:
     decided = {(d["score"], d["better"], d["worse"]) for made in rounds for d in made["summary"]["decided"]}
     both = sorted((key, a, b) for key, a, b in decided if a < b and (key, b, a) in decided)
     text = "; ".join(f"{key}: {a} and {b}" for key, a, b in both)
-    return f"Decided one way in one round and the other way in another: {text or 'nothing'}."
+    return f"Differences that two rounds decide in opposite directions: {text or 'none'}."
 
 
 def _round(made: Mapping[str, Any]) -> str:
     found, tools = made["summary"], made["summary"]["tools"]
     lines = [
         f"### {_title(made)}",
-        f"At most {made['cpu_seconds']:.0f} s of a core for a tool and case. Sealed labels: SHA-256 of their hashes "
+        f"Each tool had at most {made['cpu_seconds']:.0f} s of CPU time for a case. The labels were sealed; SHA-256 of "
+        + "their hashes: "
         + ", ".join(f"`{digest[:16]}`" for digest in made["sealed"])
         + ".",
         "",
@@ -44,13 +45,18 @@ def _round(made: Mapping[str, Any]) -> str:
         absent = found["not_offered"][score.key]
         cells = [_cell(found["scores"][score.key][tool], score, tool not in absent) for tool in tools]
         lines.append(f"| {score.title} | " + " | ".join(cells) + " |")
-    lines.append("| answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |")
-    lines += ["", "Decided:", "", *_decided(found)]
+    lines.append(
+        "| cases answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |"
+    )
+    lines += ["", "Decided differences:", "", *_decided(found)]
     for key, counted in made["no_worse"].items():
         if not counted[1]:
             continue
         title = next(score.title for score in SCORES if score.key == key)
-        lines += ["", f"armlink, {title}: at most 5 % above the best other tool in {counted[0]} of {counted[1]} cases."]
+        better = (
+            f"In {counted[0]} of {counted[1]} cases, armlink is at most 5 % above the best other tool in this score"
+        )
+        lines += ["", f"{better}: {title}."]
     missing = {row["tool"]: row["why"] for row in made["rows"] if row["state"] == "not installed"}
     lines += ["", *(f"`{tool}` is not installable here: {why}." for tool, why in missing.items())] if missing else []
     return "\n".join(lines)
@@ -82,7 +88,7 @@ def _decided(found: Mapping[str, Any]) -> list[str]:
             if each["score"] == score.key:
                 pairs.setdefault(each["better"], []).append(each["worse"])
         text = "; ".join(f"{better} is better than {', '.join(worse)}" for better, worse in pairs.items())
-        lines.append(f"- {score.title}: {text or 'nothing'}")
+        lines.append(f"- {score.title}: {text or 'none'}")
     return lines
 
 

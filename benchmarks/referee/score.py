@@ -53,19 +53,19 @@ SCORES = (
     Score("first_right", "right cause first", True, False, frozenset({"causes"})),
     Score(
         "read_right",
-        "right cause first, as read from the parameters",
+        "right effect read from the parameters",
         True,
         False,
         frozenset({"intervals", "no causes"}),
     ),
-    Score("false_sure", "a false cause when sure", True, True, frozenset({"causes"})),
-    Score("abstains", "abstains where nothing can be named", True, False, frozenset({"causes"})),
-    Score("error", "error of a parameter, over its true change", False, True, frozenset({"parameters"})),
-    Score("coverage", "95 % intervals that hold", True, False, frozenset({"intervals"})),
-    Score("width", "width of an interval, over the true change", False, True, frozenset({"intervals"})),
-    Score("residual", "held-out residual, over the nominal model's", False, True, frozenset({"model"})),
-    Score("rollout", "roll-out in MuJoCo, over the nominal model's", False, True, frozenset({"model"})),
-    Score("cpu_seconds", "seconds of a core", False, True, frozenset()),
+    Score("false_sure", "false cause with a confidence above 0.8", True, True, frozenset({"causes"})),
+    Score("abstains", "no confident cause if none can be named", True, False, frozenset({"causes"})),
+    Score("error", "error of a parameter / its true change", False, True, frozenset({"parameters"})),
+    Score("coverage", "95 % intervals that contain the true value", True, False, frozenset({"intervals"})),
+    Score("width", "width of an interval / the true change", False, True, frozenset({"intervals"})),
+    Score("residual", "held-out residual / that of the nominal model", False, True, frozenset({"model"})),
+    Score("rollout", "roll-out error in MuJoCo / that of the nominal model", False, True, frozenset({"model"})),
+    Score("cpu_seconds", "CPU time [s]", False, True, frozenset()),
 )
 
 

@@ -158,13 +158,13 @@ def test_the_table_says_who_is_better_and_what_is_not_offered():
     made |= {"rows": rows, "no_worse": {"residual": (0, 8)}}
     text = page.markdown([made])
     assert "| right cause first | not offered | 100 % (68 to 100; 8) |" in text
-    assert "| error of a parameter, over its true change | not offered | not offered |" in text
-    assert "held-out residual, over the nominal model's: peer is better than armlink" in text
+    assert "| error of a parameter / its true change | not offered | not offered |" in text
+    assert "held-out residual / that of the nominal model: peer is better than armlink" in text
     assert "not offered" in page.svg(made)
     turned = [{**each, "better": each["worse"], "worse": each["better"]} for each in found["decided"]]
     other = {**made, "seeds": [2], "summary": {**found, "decided": turned}}
-    assert "in another: nothing." in page.markdown([made, made])
-    assert "the other way in another: residual: armlink and peer" in page.markdown([made, other])
+    assert "in opposite directions: none." in page.markdown([made, made])
+    assert "in opposite directions: residual: armlink and peer" in page.markdown([made, other])
 
 
 def test_nobody_reads_or_changes_what_is_sealed(tmp_path):
