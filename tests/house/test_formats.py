@@ -86,7 +86,7 @@ def keys_of(schema: dict, at: str = "", all_of: dict | None = None, seen: set[st
     found = {}
     for name, value in schema["properties"].items():
         default = "required" if name in schema.get("required", ()) else coded(value.get("default", {}))
-        default = "its keys'" if "$ref" in value and default != "required" else default
+        default = "see its keys" if "$ref" in value and default != "required" else default
         found[at + name] = (type_of(value), range_of(value), default)
         model, between = nested(value) or ("", "")
         if model and model not in seen:
