@@ -66,7 +66,7 @@ ROWS = (
         "node.reboot:joint_2",
         "boot-up message",
         1,
-        f"the node's brake closes; the others: {QUICK_STOP}",
+        f"the brake of this joint closes; the other joints: {QUICK_STOP}",
         "joint_2: its drive has restarted (boot-up message): calibration and mode are lost; find out why, then "
         "start again",
     ),
@@ -90,7 +90,7 @@ ROWS = (
     ),
     Row(
         "nobody acknowledges",
-        "nobody acknowledges (ENOBUFS)",
+        "no node acknowledges frames (ENOBUFS)",
         "bus.full::0.5",
         "the transmit queue stays full (the sending cycle waits 50 ms)",
         1,
@@ -195,9 +195,9 @@ ROWS = (
     ),
     Row(
         "wall clock",
-        "the host's wall clock is set an hour back",
+        "the host's wall clock is set back by an hour",
         "set the wall clock",
-        "nothing: time is monotonic",
+        "it is not a fault: the link uses the monotonic clock",
         None,
         "continue",
         "nothing",
@@ -205,7 +205,7 @@ ROWS = (
     ),
     Row(
         "host stopped",
-        "the host's process stops (SIGSTOP) with a bias torque on, and continues",
+        "the host's process stops (SIGSTOP) while a joint is pressed on its stop, and continues",
         "kill -STOP, kill -CONT",
         "RPDO deadline on the device",
         1,
@@ -214,7 +214,7 @@ ROWS = (
     ),
     Row(
         "host killed",
-        "the host's process is killed (SIGKILL) with a bias torque on",
+        "the host's process is killed (SIGKILL) while a joint is pressed on its stop",
         "kill -KILL",
         "RPDO deadline on the device",
         None,
@@ -227,7 +227,7 @@ ROWS = (
 def table() -> str:
     """The table as docs/faults.md has it."""
     lines = [
-        "| fault | injected by | detected by | within | the joints | the user reads |",
+        "| fault | how it is injected | how it is detected | detected within | what the joints do | the user reads |",
         "|---|---|---|---|---|---|",
     ]
     for row in ROWS:
