@@ -57,7 +57,7 @@ _ENTRIES = (
     CatalogueEntry("actuator.saturation", "motor torque clipped at a limit", (Parameter("limit", "N·m"),)),
     CatalogueEntry(
         "base.tilt",
-        "base tilted against the model: gravity comes from another direction",
+        "base tilted relative to the model: gravity comes from another direction",
         (Parameter("angles", "rad", ("angle_1", "angle_2")),),
         whole_arm=True,
     ),
@@ -102,13 +102,13 @@ _ENTRIES = (
         "eccentric encoder disc: a position error with a period of one turn",
         (Parameter("amplitude", "rad"), Parameter("phase", "rad")),
     ),
-    CatalogueEntry("timing.delay", "torque reading delayed against the position", (Parameter("delay", "s"),)),
+    CatalogueEntry("timing.delay", "torque reading later than the position reading", (Parameter("delay", "s"),)),
     CatalogueEntry("torque.offset", "zero error of the torque sensor", (Parameter("offset", "N·m"),)),
     CatalogueEntry("torque.gain", "gain error of the torque sensor", (Parameter("gain", "1"),)),
     CatalogueEntry("torque.drift", "zero of the torque sensor drifts with time", (Parameter("rate", "N·m/s"),)),
     CatalogueEntry(
         "torque.crosstalk",
-        "torque reading picks up another joint's torque",
+        "torque sensor also reads the torque of another joint",
         (Parameter("coefficient", "N·m/(N·m)"), Parameter("source", JOINT)),
     ),
     CatalogueEntry("torque.hysteresis", "hysteresis of the torque sensor", (Parameter("width", "N·m"),)),
@@ -126,14 +126,14 @@ _ENTRIES = (
     ),
     CatalogueEntry(
         "transmission.spring",
-        "spring across the joint, such as a cable bundle",
+        "spring at the joint, such as a cable bundle",
         (Parameter("stiffness", "N·m/rad"), Parameter("rest", "rad")),
     ),
     CatalogueEntry("transmission.elasticity", "elastic transmission", (Parameter("stiffness", "N·m/rad"),)),
     CatalogueEntry("transmission.backlash", "backlash of the transmission (full width)", (Parameter("width", "rad"),)),
     CatalogueEntry(
         "transmission.coupling",
-        "motor also turns with another joint",
+        "motor also turns when another joint turns",
         (Parameter("coefficient", "1"), Parameter("source", JOINT, reported_as="other_joint")),
         estimated=(
             Parameter("inertia", "kg·m²"),

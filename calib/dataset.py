@@ -366,7 +366,7 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
             )
         if each.readings and (missing := _missing(each)):
             log.warning(
-                "%s ended before %s, so the fit uses what is there; to continue: armlink sweep %s --out %s --resume",
+                "%s ended before %s: the fit uses the readings so far; to continue: armlink sweep %s --out %s --resume",
                 *(each.path, missing, each.manifest.arm_file, each.path),
             )
     return found

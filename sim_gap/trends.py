@@ -169,7 +169,7 @@ def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
     undated = sorted(case for case in used if date_of(case) is None)
     if undated:
         return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02, so no change can be dated"
-    return f"a change can be found from {NEEDED} recordings on" if len(used) < NEEDED else ""
+    return f"at least {NEEDED} recordings are needed to find a change" if len(used) < NEEDED else ""
 
 
 def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:

@@ -233,7 +233,7 @@ class LogReader:
             return line
         if found["time"] is None:
             self.warning = (
-                "the frame log has no times (`candump -L` writes times), so the frames are taken as "
+                "the frame log has no times (`candump -L` writes times), so the frames are assumed to be "
                 f"{1e3 * SPACING:g} ms apart"
             )
             time, self._timeless = SPACING * self._timeless, self._timeless + 1

@@ -33,12 +33,12 @@ def check(
         ),
     ] = False,
     host: Annotated[
-        bool, typer.Option("--host", help="Measure instead how well this machine keeps the cycle; no bus is needed.")
+        bool, typer.Option("--host", help="Only measure how well this machine keeps the cycle; no bus is needed.")
     ] = False,
     scales: Annotated[
         str | None,
         typer.Option(
-            help="Judge instead the scales of position, velocity and torque: hand (you turn every joint from "
+            help="Check only the scales of position, velocity and torque: hand (you turn every joint from "
             "stop to stop, without power), move (this program moves all joints by 0.35 rad) or listen "
             "(another host moves the arm)."
         ),

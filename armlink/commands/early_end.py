@@ -21,7 +21,7 @@ class ArmWork:
 
 @contextlib.contextmanager
 def early_end(arm: ArmFile, resume: str | Callable[[], str] | None = None) -> Iterator[ArmWork]:
-    """Say both on standard error after Ctrl-C or a stall, once the link inside this context is closed.
+    """After Ctrl-C or a stall, print how the joints were left and how to continue, once the link inside is closed.
 
     Entered before the link is opened; `resume` is the command that continues the work, or tells it then.
     """

@@ -19,7 +19,7 @@ MOST_PARTS = 3
 
 
 def fitted(table: Table, console: Console, options: ConsoleOptions) -> RenderableType:
-    """The table as it is where it fits, else narrower as above.
+    """The table unchanged if it fits, otherwise the table with narrower columns.
 
     A title that is wider than the table becomes a line above it.
     """

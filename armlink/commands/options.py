@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 Arm = Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")]
-OtherBus = Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")]
+OtherBus = Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the bus in the arm file.")]
 Ros2 = Annotated[
     str | None,
     typer.Option(
@@ -47,7 +47,7 @@ def _of_reading(help_text: str, *names: str) -> Any:
     return typer.Option(*names, help=help_text, rich_help_panel="How to read the recordings")
 
 
-UNITS = "q=deg, q=counts:4096 (a turn), q=percent:110 (degrees at 100), t=ms, tau_motor=A:12.5 (N·m/A)"
+UNITS = "q=deg, q=counts:4096 (per turn), q=percent:110 (degrees at 100 %), t=ms, tau_motor=A:12.5 (N·m/A)"
 Many, Text = list[str] | None, str
 OF_READING: dict[str, tuple[Any, Any]] = {
     "columns": (Many, _of_reading("Columns to rename, OURS=THEIRS: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),

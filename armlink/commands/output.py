@@ -11,7 +11,7 @@ from armlink.content.printable_text import printable_json
 
 
 def write_json(path: Path | None, answer: Any) -> None:
-    """Write `answer` as JSON to `path` (`-`: standard output, None: nowhere); what is not finite becomes null."""
+    """Write `answer` as JSON to `path` (`-`: standard output, None: nowhere); numbers not finite become null."""
     if path is None:
         return
     text = printable_json(_finite(answer), indent=1, allow_nan=False) + "\n"

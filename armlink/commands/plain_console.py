@@ -125,7 +125,7 @@ def suggest(command: str) -> None:
 
 
 def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool:
-    """The answer to a question of yes or no; raises Declined where it is no and `abort`."""
+    """The answer to a yes-or-no question; raises Declined if the answer is no and `abort` is true."""
     with _question():
         agreed = typer.confirm(_wrapped_question(question), default=default, err=True)
     if abort and not agreed:

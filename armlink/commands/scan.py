@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def scan(
-    arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file; without: all drives.")] = None,
+    arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file; default: all drives.")] = None,
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:

@@ -110,7 +110,7 @@ class Field:
         if self._last is None:
             if value in self.first:
                 return ""
-            return f"{self.name} is {value} in a frame that gives power, but no reading of the joint is near this"
+            return f"{self.name} is {value} in a frame that gives power, but no reading of the joint is near this value"
         if abs(value - self._last) <= self._room_at(now):
             return ""
         return f"{self.name} changes from {self._last} to {value} in one frame, limit {self._room_at(now):g}"

@@ -311,7 +311,7 @@ class Commander:
         for drives, drive in self._drives:
             if drives.power(drive) is not target or (target is Power.ON and not drives.ready(drive)):
                 return drives.stuck(drive, target, ENABLE_SECONDS)
-        return f"no complete set of readings came within {ENABLE_SECONDS} s of cycles: frames are lost"
+        return f"in {ENABLE_SECONDS} s, no cycle had the readings of all joints: frames are lost"
 
     def restarted(self) -> bool:
         return any(drives.has_restarted(drive) for drives, drive in self._drives)

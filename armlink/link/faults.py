@@ -94,7 +94,7 @@ def refusal(
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
             return (
-                f"{name}: reads {now.position:.4g} rad under torque control, but can only stand at {lower:.4g} "
+                f"{name}: reads {now.position:.4g} rad under torque control, but its range is {lower:.4g} "
                 f"to {upper:.4g} rad: one of its stops or its position sensor is not where the arm file says"
             )
         if why == gate.ENTRY:

@@ -47,11 +47,11 @@ def announcement(arm: ArmFile) -> str:
         if any(each.silence != each.reaction(keeper) for each in traits):
             steps += (
                 f" Finally, no joint gets commands for {PATIENCE * deadline:.0f} ms: the keeper must hold every joint "
-                "whose drive keeps on."
+                "whose drive continues its last command."
             )
     end = "the joints hold, in quick stop"
     if not all(each.silence == "holds" for each in traits):
-        end = "the arm is parked or slowly lowered, and its power switched off"
+        end = "the arm is parked or slowly lowered, and its power is switched off"
     return (
         f"This test enables every joint of {arm.name} and lets it hold where it stands (with at most its max_torque). "
         f"{steps} At the end {end}. A drive that reacts in another way may let its joint fall: put the arm where no "
@@ -267,7 +267,7 @@ class SelfTest:
     def _keeper(self, kept: list[int]) -> None:
         """No command for any joint: does the keeper hold those whose drives would keep on with their last one?"""
         link, loop = self.link, self.link.commander.loop
-        seconds, left = PATIENCE * link.section.deadline, "; if this machine or a cable fails, the last command goes on"
+        seconds, left = PATIENCE * link.section.deadline, "; no keeper helps if the machine or a cable fails"
         if loop.keeper is None:
             for joint in kept:
                 told = f"its drive keeps on with its last command, and no keeper is needed in a simulation{left}"

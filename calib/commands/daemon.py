@@ -56,7 +56,7 @@ def daemon(
         bool, typer.Option("--work", help="Move the arm to random poses, to try the daemon on a simulated arm.")
     ] = False,
 ) -> int:
-    """Watch an arm for months, until SIGTERM; SIGHUP reads the arm file again, SIGUSR1 asks for a sweep.
+    """Watch an arm for months, until SIGTERM; SIGHUP reads the arm file again, SIGUSR1 requests a sweep.
 
     Example: armlink daemon sarcos --bus socketcan:can0 --listen-only --policy propose
     """

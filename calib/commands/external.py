@@ -21,7 +21,7 @@ def external(
     arm: ArmOrModel,
     stated: "Corrections",
     recordings: Annotated[
-        list[str] | None, typer.Argument(help="Recordings to judge; by default listen to the arm.")
+        list[str] | None, typer.Argument(help="Recordings to examine; without any, listen to the arm.")
     ] = None,
     baseline: Annotated[
         list[str] | None,
@@ -102,7 +102,7 @@ def external(
     if out is not None:
         require_writable(out)
         if not recordings:
-            raise BadInput(f"--out {out}: give recordings to judge")
+            raise BadInput(f"--out {out}: this option needs recordings")
     per_hour = parse_rate(false_alarms)
     records = _records(arm, base, tip, tool, store)
     names = records.stated.arm.names
@@ -150,7 +150,7 @@ def external(
         _tell(console, answers[-1], names)
     if picture is not None:
         places, force = smallest_forces(listener.model, place, per_hour)
-        draw_map(picture, places, force, f"{arm}: smallest force at {names[place.link]} found in 95 %, at rest")
+        draw_map(picture, places, force, f"{arm}: force at {names[place.link]} that is found in 95 % of cases, at rest")
         console.print(f"{picture}: half of the workspace needs {np.median(force):.1f} N or less")
     if out is not None:
         save_heard(out, every, names)

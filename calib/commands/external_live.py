@@ -65,8 +65,8 @@ def follow(
                 show(live, newest, first)
     if heard and not rows:
         raise BusFault(
-            f"{heard} samples of {arm.name} were heard, but in no second had all joints both position and "
-            f"{learned.listener.channel}, which the learned model needs"
+            f"{heard} samples of {arm.name} were heard, but the learned model needs position and "
+            f"{learned.listener.channel} of all joints within a second, and they never came"
         )
     if newest is not None and out.is_terminal:
         out.print(_table(live, newest, first))

@@ -19,7 +19,7 @@ def history(
     store: Store = None,
     record: Annotated[str | None, typer.Option(help="Print only this record, as YAML.")] = None,
     import_file: Annotated[
-        Path | None, typer.Option("--import", help="First add the record of this YAML file.")
+        Path | None, typer.Option("--import", help="Add the record in this YAML file before listing.")
     ] = None,
     activate: Annotated[
         bool, typer.Option("--activate", help="With --import: also make the added record current.")

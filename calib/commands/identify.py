@@ -60,7 +60,7 @@ def identify(
         Path | None, typer.Option(help="Also write base parameters as YAML for ROS 2.", rich_help_panel=POSES)
     ] = None,
     plan: Annotated[
-        int, typer.Option(min=0, max=100, help="Also list this many new poses that help most.", rich_help_panel=POSES)
+        int, typer.Option(min=0, max=100, help="Number of further poses to propose.", rich_help_panel=POSES)
     ] = 0,
     store: Store = None,
     json_file: JsonFile = None,

@@ -194,7 +194,7 @@ def _show(judged: Judged, console: "PlainConsole") -> None:
         "gravity ± [N·m]": (fit.bound(fit.readings.position), nothing),
     }
     print_intervals(
-        "Mass moments, ± half of the 95 % interval, and bound of gravity's RMS error", fit.arm.names, columns, console
+        "Mass moments ± half of the 95 % interval, bound of the RMS error of gravity", fit.arm.names, columns, console
     )
     sensors = {}
     for title, family in (("gain", "gain"), ("offset [N·m]", "offset"), ("Coulomb friction [N·m]", "coulomb")):
@@ -228,6 +228,6 @@ def _show_plan(judged: Judged, poses: Array, bound: Array, console: "PlainConsol
     console.print(table)
     after = ", ".join(f"{name} {value:.2g}" for name, value in zip(judged.fit.arm.names, bound, strict=True))
     console.print(
-        "if these poses are approached and read from both sides, the bound of gravity's RMS error becomes [N·m]: "
+        "if these poses are approached and read from both sides, the bound of the RMS error of gravity becomes [N·m]: "
         f"{after}. The poses are within the joint limits; they were not checked for collisions"
     )

@@ -21,7 +21,7 @@ def observe(
     arm: Arm,
     recording: Annotated[
         Path | None,
-        typer.Argument(help="A recording of the arm at work, in place of a live source.", show_default=False),
+        typer.Argument(help="A recording of the arm at work, instead of a live source.", show_default=False),
     ] = None,
     bus: OtherBus = None,
     ros2: Ros2 = None,

@@ -28,7 +28,7 @@ SweepsArm = Annotated[
 APPLY = "With --apply"
 """Group of the options that only count when a record is written to the controllers, in a command's help."""
 Bus = Annotated[
-    str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.", rich_help_panel=APPLY)
+    str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], not the bus in the arm file.", rich_help_panel=APPLY)
 ]
 Check = Annotated[
     bool,

@@ -22,7 +22,7 @@ def weigh(
     yes: WithoutAsking = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Drive to poses and weigh the tool or payload that the arm carries, beyond its gravity record.
+    """Drive to poses and weigh the tool or payload that the arm carries in addition to its gravity record.
 
     The arm must have been calibrated and identified. A declared `tool` is weighed, too.
 

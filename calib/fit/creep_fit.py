@@ -129,10 +129,10 @@ class CreepFit(FittedCalibration):
                 reasons[name, "offset"] = "no sweep of this joint determines it"
             if joint == self.arm.n - 1 and doubt["zero"][joint] <= LAST_ZERO:
                 reasons[name, "position_offset"] = (
-                    "turning the last link's frame is the same as turning its centre of mass"
+                    "an error of this zero looks the same as a turned centre of mass of the last link"
                 )
             elif zero[joint] >= MOST_ZERO_DOUBT:
-                reasons[name, "position_offset"] = "the sweeps add nothing to what was known before about this value"
+                reasons[name, "position_offset"] = "the sweeps give no information about this value"
         return reasons
 
     def _no_gain(self, joint: int) -> str:

@@ -102,8 +102,8 @@ class PoseFit:
     def not_determined(self) -> tuple[str, ...]:
         """A sentence for each direction of gains and mass moments that the poses leave open."""
         of_scale = (
-            f"a factor common to all torques and masses: the gain of {self.scale} counts as 1. Poses with a known "
-            "mass determine this factor (--reference-mass FILE=KG)"
+            f"a factor common to all torques and masses; it is set so that the gain of {self.scale} is 1. Poses with a "
+            "known mass determine this factor (--reference-mass FILE=KG)"
         )
         return (*[of_scale] * bool(self.scale), *self._identifiability[1])
 

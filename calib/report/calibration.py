@@ -259,7 +259,7 @@ def _number(value: float | None, form: str) -> str:
 
 def _creeps(fit: CreepFit) -> ReportSection:
     text = (
-        "At each position, half the sum of the readings up (▸) and down (◂) is gravity, and half their "
+        "At each position, half the sum of upward (▸) and downward (◂) readings is gravity, and half their "
         "difference is friction."
     )
     return ReportSection(

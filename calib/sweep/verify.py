@@ -126,8 +126,8 @@ def run_verify(
     held_out = at(mover.position)
     if not len(held_out):
         raise Refused(
-            f"{arm_file.name}: according to the model, bodies touch on the way from the present pose to every other: "
-            "move the arm to a free pose, or correct the model's collision shapes"
+            f"{arm_file.name}: according to the model, bodies touch on the way from the present pose to every other "
+            "pose: move the arm to a pose without contact, or correct the model's collision shapes"
         )
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
@@ -143,7 +143,7 @@ def run_verify(
     if not angles:
         raise Refused(
             f"none of {len(held_out)} poses was reached, since a joint stalled on the way to each: check that nothing "
-            "blocks the arm, and max_torque"
+            "blocks the arm, and that max_torque suffices"
         )
     q = np.array(angles)
     model = gravity_torque(kinematics, beta, q)

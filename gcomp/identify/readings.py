@@ -44,7 +44,7 @@ class StaticReadings:
         count, n = position.shape
         torque = as_array("torque", self.torque, (count, n), finite=False)
         if np.isinf(torque).any():
-            raise BadArray("torque has infinite readings: write NaN for a reading that does not count")
+            raise BadArray("torque has infinite readings: write NaN for a reading that is to be ignored")
         sigma = np.array(np.broadcast_to(as_array("sigma", np.atleast_2d(self.sigma), (None, n)), (count, n)))
         if np.any(sigma <= 0):
             raise BadArray(f"sigma is {sigma.min()}, expected every standard deviation above zero [N·m]")

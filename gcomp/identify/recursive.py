@@ -44,7 +44,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings) -> RecursiveFit:
         rows = readings.counted[:, i]
         if not rows.any():
             raise BadArray(
-                f"joint {arm.names[i]}: no torque reading of this joint counts: sweep it, or leave it out of the arm"
+                f"joint {arm.names[i]}: this joint has no usable torque reading: sweep it, or leave it out of the arm"
             )
         weight = 1 / readings.sigma[rows, i]
         regressor = gravity_regressor(arm, readings.position[rows])[:, i] * weight[:, None]

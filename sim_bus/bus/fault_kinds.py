@@ -18,7 +18,7 @@ KINDS = {
         FaultKind("node.babbling", True, "frames/s", 5000.0, "the node sends frames of identifier 001h"),
         FaultKind("node.duplicate", True, "", 0.0, "a second node has the same id: every frame comes twice"),
         FaultKind("bus.off", False, "restart time [s]", 0.1, "the host's controller is bus-off and then restarts"),
-        FaultKind("bus.full", False, "duration [s]", math.inf, "nobody acknowledges: the transmit queue stays full"),
+        FaultKind("bus.full", False, "duration [s]", math.inf, "the queue stays full: no node acknowledges frames"),
         FaultKind("link.down", False, "duration [s]", math.inf, "the interface is down"),
         FaultKind("reader.slow", False, "frames", 4.0, "the host's receive queue holds only this number of frames"),
         FaultKind("frame.short", True, "share of frames", 1.0, "position and torque come in frames of three bytes"),
@@ -27,7 +27,7 @@ KINDS = {
         FaultKind("sdo.abort", True, "", 0.0, "every SDO request is aborted (0800 0022h)"),
         FaultKind("sdo.timeout", True, "", 0.0, "no SDO request is answered"),
         FaultKind("mode.refused", True, "mode", 10.0, "the controller does not enter this mode of operation"),
-        FaultKind("clock.jump", False, "jump [s]", 1.0, "time jumps: as if the host had slept"),
+        FaultKind("clock.jump", False, "jump [s]", 1.0, "time jumps, as if the host had been suspended"),
     )
 }
 ALL_KINDS = KINDS | DRIVE_KINDS | FALSE_READINGS

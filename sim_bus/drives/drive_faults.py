@@ -20,7 +20,7 @@ class FaultKind:
 DRIVE_KINDS = {
     kind.id: kind
     for kind in (
-        FaultKind("drive.trip", True, "", 0.0, "the drive's watchdog trips although its host is there"),
+        FaultKind("drive.trip", True, "", 0.0, "the drive's watchdog trips although its host is alive"),
         FaultKind("drive.latched", True, "", 0.0, "the drive's watchdog trips, and only a power cycle clears it"),
         FaultKind("drive.mode", True, "mode", 2.0, "the drive changes to this mode of control"),
         FaultKind("drive.classic", True, "", 0.0, "the drive answers CAN FD frames with classical frames"),
@@ -28,7 +28,7 @@ DRIVE_KINDS = {
         FaultKind("scale.velocity", True, "factor", 1.25, "velocities have a larger range than the drive reports"),
         FaultKind("scale.torque", True, "factor", 1.25, "torques have a larger range than the drive reports"),
         FaultKind("feedback.lost", True, "", math.inf, "the drive has lost its encoder, or sends no feedback"),
-        FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted and does nothing"),
+        FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted, but has no effect"),
     )
 }
 

@@ -102,7 +102,7 @@ def _at_bounds(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     names = fit.signals[0].arm.names
     return tuple(
         f"{term.effect} of {'the arm' if term.form.signature.whole_arm else names[term.place]} has reached "
-        "the largest or least value that can exist: these recordings do not determine its size"
+        "the largest or smallest possible value: these recordings do not determine its size"
         for term in estimate.at_bounds()
     )
 

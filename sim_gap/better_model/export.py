@@ -76,7 +76,7 @@ def model_files(
     ]
     lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
-    comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
+    comment = xml_comment([f"Effects that MJCF cannot represent ({module} applies them):", *lines]) if lines else ""
     effects = joint_effects(sim, estimate, corrected.not_held, corrected.held)
     return CorrectedText(comment + spec.to_xml(), tuple(lines), (*effects, *laws), spec)
 

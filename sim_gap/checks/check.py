@@ -242,7 +242,7 @@ def check_position_only(
     for recording, label in zip(recordings, labels, strict=True):
         if recording.position_command is None or not np.isfinite(recording.position_command).any():
             raise BadInput(
-                f"{label}: no torque channel and no commanded position holds a number: record tau_1 …, "
+                f"{label}: no torque channel and no commanded position has a number: record tau_1 …, "
                 "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
             )
         refuse(label, find_counts(recording, stated), find_beyond_range(arm, recording, stated))

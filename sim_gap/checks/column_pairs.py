@@ -154,7 +154,7 @@ def require_commands(recordings: Sequence[Recording], label: str, stated: Correc
                     f"{column}={column}"
                 )
                 remedy = f"give the order with {exchange}" if exchange else confirmed
-                what = f"{column} is followed by q_{other + 1} (correlation {match[other]:.2f}), not by q_{j + 1} "
+                what = f"{column} belongs to q_{other + 1} (correlation {match[other]:.2f}), not to q_{j + 1} "
                 what += f"({match[j]:.2f})"
             elif kind == "sign":
                 remedy = f"give --sign {column}=-1 or, if q has the wrong sign, --sign q_{j + 1}=-1"

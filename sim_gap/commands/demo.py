@@ -30,7 +30,7 @@ def demo(
 ) -> None:
     """Run the whole procedure on a simulated arm on an in-process CAN bus and write report.html and summary.json.
 
-    For a model (armlink demo --arm my-arm.urdf), an arm file is made first in the folder, as armlink new makes it.
+    If --arm is a URDF or MJCF model, the command first makes an arm file in the folder, as armlink new does.
 
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """

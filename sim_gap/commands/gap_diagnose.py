@@ -219,7 +219,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     if positions and batch_path(path).is_file():
         console.print(f"the same model without PID actuators, for MuJoCo Warp: {batch_path(path)}")
     if left_out and module_path(path).is_file() and model.is_file() and not (positions and kind == "URDF"):
-        console.print(f"in a simulation of {model}, {module_path(path)} applies the effects that MJCF cannot hold")
+        console.print(f"in a simulation of {model}, {module_path(path)} applies the effects that MJCF cannot represent")
 
 
 def show(answer: "Diagnosis", console: "Console") -> None:

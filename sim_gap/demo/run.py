@@ -328,7 +328,7 @@ class Demo:
             columns,
         )
         text = f"Each joint {swept} a reference mass; the true values were hidden from the fit."
-        truths = ReportSection("Sensor calibration and the truth", paragraph(text), (), [table])
+        truths = ReportSection("Sensor calibration and the true values", paragraph(text), (), [table])
         account.sections += [*parts[:1], truths, *parts[1:]]
         error = np.abs(fit.value("gain") / truth.gain - 1)
         unseen = ", ".join(name for name, each in zip(fit.names, error, strict=True) if np.isnan(each))
@@ -342,7 +342,7 @@ class Demo:
         columns |= {"largest error": errors["max_abs_error"], "largest torque": largest}
         columns |= {f"sag, {model} model [°]": np.degrees(sag) for model, sag in sags.items()}
         title = (
-            f"gravity model [N·m], compared with the sensors at {poses} poses and with the truth at "
+            f"gravity model [N·m], compared with the sensors at {poses} poses and with the true values at "
             f"{errors['poses']} poses"
         )
         table = account.table(title, check.names, {name: (each, 0 * each) for name, each in columns.items()})

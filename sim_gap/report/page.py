@@ -21,10 +21,10 @@ from sim_gap.report.figures import (
 )
 
 PARAMETERS = {
-    "N·m": "Fitted parameters, each as a difference to the value of the model.",
+    "N·m": "Fitted parameters, each as a difference from the value of the model.",
     "rad": (
         "Fitted parameters: for joints and controller the values of the arm, for links, zeros and base the "
-        "change against the model."
+        "change relative to the model."
     ),
 }
 """Meaning of the parameters of a diagnosis, by the unit of its gap."""

@@ -293,9 +293,7 @@ def prepare(
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
-        raise BadInput(
-            f"{label}: no torque channel holds a number: at least one of tau, tau_motor and tau_cmd is needed"
-        )
+        raise BadInput(f"{label}: no torque channel has a number: at least one of tau, tau_motor and tau_cmd is needed")
     near = are_near_spikes(recording.t, list(spikes.values()), times)
     known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)

@@ -110,7 +110,7 @@ def test_recordings_in_degrees_are_followed_with_the_options_of_a_diagnosis(flee
     units = ["--units", "q=deg"]
     first = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
     assert json.loads(first.stdout)["newest"]["answer"]["causes"][0]["effect"] == "friction.coulomb"
-    assert "1 recording: a change can be found from 13 recordings on" in " ".join(first.stderr.split())
+    assert "1 recording: at least 13 recordings are needed to find a change" in " ".join(first.stderr.split())
     (line,) = (tmp_path / "answers.jsonl").read_text(encoding="utf-8").splitlines()
     assert set(json.loads(line)["options"]["units"]) == {"q"}
     (tmp_path / "2026-10-02.parquet").write_bytes(b"")  # it is diagnosed, and need not be read again

@@ -101,7 +101,7 @@ class SenderClock:
             return None
         if stamp < self._stamp:
             log.warning(
-                "the time stamps of joint states went back by %.1f s: the times of samples still increase",
+                "the time stamps of joint states went back by %.1f s: armlink makes the times of samples increase",
                 self._stamp - stamp,
             )
             self._shift = math.inf
@@ -234,7 +234,7 @@ class ListeningBus(InProcessBus):
         owned = [(number, name) for number, name in named if self._owns(message, name)]
         if len(owned) < len(named):
             twice = ", ".join(name for number, name in named if (number, name) not in owned)
-            self._remark(f"two publishers send {twice}: the first one counts")
+            self._remark(f"two publishers send {twice}: armlink uses the first one")
         if not owned:
             return
         time = self._clocks[message.source].time(message.stamp, message.arrived)
@@ -297,7 +297,7 @@ class ListeningBus(InProcessBus):
         value = float(column[number])
         if not math.isfinite(value):
             if what != "target":
-                self._remark(f"{name}: the {what} in the message is no number")
+                self._remark(f"{name}: the {what} in the message is not a number")
             return math.nan
         return value
 

@@ -154,7 +154,7 @@ class RobotLine:
 
     def absence(self) -> str:
         return (
-            f"start the program that runs the robot by `python -m armlink.lerobot COMMAND …`, as the same user and on "
+            f"start the program of the robot with `python -m armlink.lerobot COMMAND …`, as the same user and on "
             f"port {self._port} (docs/listening.md)"
         )
 

@@ -65,7 +65,7 @@ class MyActuatorSettings(DriveSettings):
         if self.torque_constant is not None and self.torque_constant < usual / math.sqrt(LEAST_GEAR):
             raise ValueError(
                 f"torque_constant {self.torque_constant:g} is that of the motor before the gear, so currents would be "
-                f"too large: give the torque constant at the output ({usual:.3g} N·m/A by an {self.model}'s ratings)"
+                f"too large: give the torque constant at the output ({usual:.3g} N·m/A for an {self.model})"
             )
         return self
 

@@ -329,7 +329,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     if not wanted <= {can_id for can_id, data in bus.heard if len(data) == 8}:
         return []
     firmware = read_firmware(bus)
-    note = "" if firmware else "the arm does not report its firmware: S-V1.8-2 assumed"
+    note = "" if firmware else "the arm does not report its firmware: S-V1.8-2 is assumed"
     stated = firmware or "S-V1.8-2"
     return [
         FoundDrive("piper", n, f"joint {n}", {"joint": n, "firmware": stated}, model="AgileX Piper", note=note)

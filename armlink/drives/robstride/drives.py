@@ -301,7 +301,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
             max_torque=RANGES[model].torque,
             largest_gains=(RANGES[model].kp, RANGES[model].kd),
             model=" or ".join(models),
-            note=f"model {model} assumed, compare it with the label: {why}",
+            note=f"model {model} is assumed, so compare it with the label: {why}",
             answers=came[motor],
         )
         found.append(each)

@@ -145,7 +145,7 @@ def chosen_poses(arm_file: ArmFile, here: Array, poses: int, work: int, seed: in
         touching = planned.geometry.contacts(here) if planned.geometry is not None else []
         bodies = " and ".join(touching[0].bodies) if touching else "none at its pose"
         raise Refused(
-            "from where the arm is, no pose is reached without a collision of the model's shapes (touching now: "
+            "the arm reaches no pose from its present pose without a collision of the model's shapes (touching now: "
             f"{bodies}): move the arm clear, or correct the shapes"
         )
     return tour, at_work

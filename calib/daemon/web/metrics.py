@@ -24,7 +24,7 @@ JOINT = (
     ("position", "joint_position_radians", "Position sensor."),
     ("torque", "joint_torque_newton_metres", "Torque sensor reading, as the drive calibrates it."),
     ("model_torque", "joint_model_torque_newton_metres", "Gravity model at this position."),
-    ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful at rest."),
+    ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful only at rest."),
     ("temperature", "joint_temperature_celsius", "Temperature of the drive, if it reports one."),
     ("external_torque", "joint_external_torque_newton_metres", "Torque with which the surroundings push the joint."),
     ("external_bound", "joint_external_bound_newton_metres", "Half width of its 95 % interval."),

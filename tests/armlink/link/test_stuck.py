@@ -12,7 +12,7 @@ from armlink.link.cycle import ENABLE_SECONDS, Commander
 @pytest.mark.parametrize(
     ("power", "ready", "says"),
     [
-        (Power.ON, True, f"no complete set of readings came within {ENABLE_SECONDS} s of cycles: frames are lost"),
+        (Power.ON, True, f"in {ENABLE_SECONDS} s, no cycle had the readings of all joints: frames are lost"),
         (Power.ON, False, "joint 0 is stuck"),
         (Power.OFF, True, "joint 0 is stuck"),
     ],

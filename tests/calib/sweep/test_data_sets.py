@@ -51,7 +51,7 @@ def test_a_sweep_that_was_ended_early_says_where(tmp_path: Path, caplog: pytest.
     assert len(data.readings) == 14
     assert data.plan is not None
     last = data.plan.sweeps[0].name
-    assert f"{folder} ended before the end of sweep {last}, so the fit uses what is there" in caplog.text
+    assert f"{folder} ended before the end of sweep {last}: the fit uses the readings so far" in caplog.text
     assert caplog.text.endswith(f"to continue: armlink sweep {data.manifest.arm_file} --out {folder} --resume\n")
     caplog.clear()
     data_sets([written(tmp_path / "scout", 2, planned=False)])

@@ -33,12 +33,12 @@ def check(recording, stated=AS_IT_IS):
 )
 def test_the_option_settles_whose_command_it_is(servo, holds, option):
     spoiled = replace(servo, position_command=servo.position_command[:, holds])
-    with pytest.raises(BadInput, match="is followed by q_") as refused:
+    with pytest.raises(BadInput, match="belongs to q_") as refused:
         check(spoiled)
     if holds == [1, 0]:
         assert option in str(refused.value)
     else:
-        assert "elbow: q_cmd_2 is followed by q_1" in str(refused.value)
+        assert "elbow: q_cmd_2 belongs to q_1" in str(refused.value)
         assert "--map q_cmd_2=COLUMN; if q_cmd_2 is right, confirm it with --map q_cmd_2=q_cmd_2" in str(refused.value)
     stated = parse_corrections(columns=[option.removeprefix("--map ")])
     assert check(stated.apply(spoiled, "r.csv"), stated)[1] == []

@@ -149,8 +149,8 @@ def test_a_value_that_is_no_number_is_missing(value):
     np.testing.assert_allclose(found[1].position[1], 0.2)
     assert np.isnan(found[1].torque).all()
     assert bus.said() == [
-        "a: the position in the message is no number (1 times)",
-        "b: the effort in the message is no number (1 times)",
+        "a: the position in the message is not a number (1 times)",
+        "b: the effort in the message is not a number (1 times)",
     ]
 
 
