@@ -115,7 +115,7 @@ def results(json: Path | None = None) -> PlainConsole:
 
 
 def command_line(*words: str, **options: object) -> str:
-    """A command ready to be pasted; an option is left out where its value is None."""
+    """A command ready to be pasted; an option whose value is None is left out."""
     given = [(f"--{name.replace('_', '-')}", str(value)) for name, value in options.items() if value is not None]
     return shlex.join(["armlink", *words, *(word for pair in given for word in pair)])
 
@@ -134,7 +134,7 @@ def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool
 
 
 def ask(question: str, **options: Any) -> Any:
-    """The answer to a question; `options` as of `typer.prompt`."""
+    """The answer to a question; `options` are those of `typer.prompt`."""
     with _question():
         return typer.prompt(_wrapped_question(question), err=True, **options)
 

@@ -17,9 +17,9 @@ WAIT_SECONDS = 0.2
 def heard_samples(
     arm: "ArmFile", bus: str | None, seconds: float, row: "Callable[[Listener, Sample], Row]"
 ) -> Iterator[list[Row]]:
-    """Rows that `row` makes of samples, until the time is over (0: never) or Ctrl-C; those that came together at once.
+    """Rows that `row` makes from samples, until the time is over (0: no end) or Ctrl-C; one list for each batch.
 
-    The list is empty where none came for a while. Raises BusFault if none comes at all.
+    The list is empty if no sample came for a while. Raises BusFault if no sample comes at all.
     """
     from armlink.bus.listening.joint_messages import silence_of
     from armlink.bus.open import open_link_bus

@@ -156,7 +156,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
 
 
 def unsettled_lines(data: "SweepData") -> list[str]:
-    """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
+    """In one line, the readings taken while the arm had not settled; empty if there are none."""
     if not data.unsettled:
         return []
     places = [

@@ -363,7 +363,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
             real = beat is not None and not beat.error & ~known and beat.state <= max(AxisState) and beat.done <= 1
             beats.setdefault(node, []).append(real)
     return [
-        FoundDrive("odrive", node, f"node {node}", {"node": node}, note="gear 1 is assumed (motor torques)")
+        FoundDrive("odrive", node, f"node {node}", {"node": node}, note="gear 1 assumed: torques are the motor's")
         if node < 0x3F
         else FoundDrive("odrive", node, f"node {node}", wrong="an axis without a node id: set axis0.config.can.node_id")
         for node, real in sorted(beats.items())

@@ -19,7 +19,7 @@ SCHEMA = "armlink.new/1"
 
 
 def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
-    """An arm file of nothing but a bus: its drives, and no geometry."""
+    """An arm file made from a bus alone: it has the drives, but no geometry."""
     from armlink.arm_file import parse_arm
     from calib.commissioning.drive_match import arm_of_bus
 
@@ -116,7 +116,7 @@ def open_named(bus: str) -> "CanBus":
 
 
 def search(opened: "CanBus") -> "BusDrives":
-    """The drives on an open bus; which families were looked for is said, and what must be set otherwise in a drive."""
+    """The drives on an open bus; prints the families that were looked for, and settings that must be changed."""
     from armlink.commands.plain_console import PlainConsole
     from armlink.drives.discovery import BusDrives
 

@@ -62,7 +62,7 @@ def parse_locks(texts: Sequence[str]) -> dict[str, float]:
 
 
 def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
-    """How a person is asked to turn a joint; None where drives are taken in order. Raises BadInput."""
+    """The function that asks a person to turn a joint; None if drives are taken in order. Raises BadInput."""
     if by_hand and not interactive:
         raise BadInput(
             "--by-hand needs a terminal for its questions: run the command on a terminal, or leave `--by-hand` out"
