@@ -219,7 +219,7 @@ ROWS = (
         "RPDO deadline on the device",
         None,
         QUICK_STOP,
-        "nothing: it is dead; `armlink monitor` shows quick stop",
+        "nothing, since the host's process is dead; `armlink monitor` shows quick stop",
     ),
 )
 
