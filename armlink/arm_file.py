@@ -134,7 +134,7 @@ def _drive_settings(family: str) -> type[Section]:
     found = named("armlink.drives", family)
     if found is None:
         known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
-        raise ValueError(f"drive family {family!r} is unknown; there are {known}")
+        raise ValueError(f"drive family {family!r} is unknown; expected one of {known}")
     settings: type[Section] = found.settings
     return settings
 

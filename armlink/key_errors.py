@@ -29,14 +29,14 @@ def describe_all(error: ValidationError, within: str = "", of: type[BaseModel] |
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """`; did you mean …?` where a known word is close, else `; there are …`."""
+    """`; did you mean …?` where a known word is close, else `; expected one of …`."""
     words = sorted(known)
     folded = {each.casefold(): each for each in words}
     swapped = [each for each in folded if sorted(each.split("_")) == sorted(word.casefold().split("_"))]
     close = swapped or difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.6)
     if close:
         return f"; did you mean {folded[close[0]]}?"
-    return f"; there are {', '.join(words)}" if words else ""
+    return f"; expected one of {', '.join(words)}" if words else ""
 
 
 def _finding(found: typing.Any, within: str, of: type[BaseModel] | None) -> tuple[str, str]:

@@ -143,7 +143,7 @@ def sim_section(arm: ArmFile) -> SimSection:
     for number, entry in enumerate(section.effects):
         if entry.joint is not None and entry.joint not in arm.joint_names:
             raise BadInput(
-                f"{arm.path}: key sim.effects.{number}.joint: there is no joint {entry.joint!r}; there are "
+                f"{arm.path}: key sim.effects.{number}.joint: there is no joint {entry.joint!r}; expected one of "
                 f"{', '.join(arm.joint_names)}"
             )
     return section

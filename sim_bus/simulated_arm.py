@@ -317,7 +317,7 @@ class SimulatedArm:
         if isinstance(joint, int):
             return joint
         if joint not in self.names:
-            raise BadInput(f"there is no joint {joint!r}; there are {', '.join(self.names)}")
+            raise BadInput(f"there is no joint {joint!r}; expected one of {', '.join(self.names)}")
         return self.names.index(joint)
 
     def _receive_pdo(self, pdo: MappedPdo, data: bytes) -> None:

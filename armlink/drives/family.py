@@ -72,5 +72,5 @@ def family(name: str) -> Family:
     """The family of this name; raises BadInput."""
     found: Family | None = named(GROUP, name)
     if found is None:
-        raise BadInput(f"drive family {name!r} is unknown; there are {', '.join(family_names())}")
+        raise BadInput(f"drive family {name!r} is unknown; expected one of {', '.join(family_names())}")
     return found

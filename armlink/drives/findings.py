@@ -145,5 +145,5 @@ def count_answers(
     for now, then, timely in zip(board.came, before, in_time.tolist(), strict=True):
         came = min(now - then, cycles)
         late = f", {came - timely} of them late: this host, the bus or the drive is busy" if came > timely else ""
-        found.append((came >= ANSWERED * cycles, f"{came} of {cycles} cycles answered{late}"))
+        found.append((came >= ANSWERED * cycles, f"replies came in {came} of {cycles} cycles{late}"))
     return found

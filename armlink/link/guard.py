@@ -41,9 +41,9 @@ class Crossed(Refused):
 
     def __init__(self, name: str, joint: int, bound: str, position: float, target: float) -> None:
         """Joint's name and index; `range` or `lag`; where it is and where it should be [rad]."""
-        what = f"it does not follow its target {target:.3f} rad"
+        what = f"the joint does not follow its target {target:.3f} rad"
         if bound == "range":
-            what = "it left the range that the command allows"
+            what = "the joint left the range that the command allows"
         super().__init__(f"{name}: at {position:.3f} rad {what}")
         self.name, self.joint, self.bound, self.position, self.target = name, joint, bound, position, target
         self.sample: Any = None

@@ -88,7 +88,7 @@ def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:
         if name not in arm.names:
             known = ", ".join(arm.names)
             raise BadInput(
-                f"{arm_file.path}: key kinematics.stops.{name}: there is no joint of this name; there are {known}"
+                f"{arm_file.path}: key kinematics.stops.{name}: there is no joint of this name; expected one of {known}"
             )
     limits = [stops.get(name, own) for name, *own in zip(arm.names, arm.lower, arm.upper, strict=True)]
     return replace(arm, lower=np.array([low for low, _ in limits]), upper=np.array([high for _, high in limits]))
@@ -188,7 +188,7 @@ def stated_model(model: str, base: str | None = None, tip: str | None = None, to
         moments = tool_moments(placed.arm.arm, None if tool is None else parse_tool(tool))
         return StatedModel(placed.arm.arm, placed, path, placed.arm.beta + moments)
     if base is not None or tip is not None:
-        raise BadInput("--base, --tip: only for a URDF or MJCF file; an arm file describes its chain under kinematics")
+        raise BadInput("--base and --tip need a URDF or MJCF file; an arm file describes its chain under kinematics")
     arm_file = with_tool(load_arm(model), tool)
     if arm_file.model_path is None:
         return StatedModel(gcomp_arm(arm_file), None, None, None, arm_file)

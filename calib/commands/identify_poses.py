@@ -40,7 +40,7 @@ class PoseOptions:
         """Raise BadInput if one was given."""
         for each in fields(self):
             if getattr(self, each.name) != each.default:
-                raise BadInput(f"--{each.name.replace('_', '-')}: only for poses: give the robot's model with --model")
+                raise BadInput(f"--{each.name.replace('_', '-')} is only for poses: give the model with --model")
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,14 +21,14 @@ ChainTip = Annotated[
     str | None,
     typer.Option("--tip", help="Last body of the chain in the model file; by default the last body that moves."),
 ]
-Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, with and without a reference mass.")]
+Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweeps, with and without a reference mass.")]
 SweepsArm = Annotated[
     str | None, typer.Option("--arm", help="Arm file, if it is no longer where it was during the sweep.")
 ]
 APPLY = "With --apply"
 """Group of the options that only count when a record is written to the controllers, in a command's help."""
 Bus = Annotated[
-    str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], not the bus in the arm file.", rich_help_panel=APPLY)
+    str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default: bus of the arm file.", rich_help_panel=APPLY)
 ]
 Check = Annotated[
     bool,
@@ -91,9 +91,9 @@ Tool = Annotated[
 
 
 def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore") -> "tuple[Array, str] | None":
-    """Mass moments (2n,) [kg·m] of the record named, else of the current one, and their origin; None without one.
+    """Mass moments (2n,) [kg·m] of the given or current record, and their origin; None if there is no record.
 
-    Raises BadInput where it is no gravity record, Refused where it is of another arm.
+    Raises BadInput if the record is no gravity record, Refused if it belongs to another arm.
     """
     import numpy as np
 

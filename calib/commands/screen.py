@@ -213,6 +213,6 @@ def print_intervals(
 
 
 def print_lines(lines: list[str], style: str | None = None, console: PlainConsole = _CONSOLE) -> None:
-    """Plain lines, or in a style of rich's such as `yellow`; by default on standard error."""
+    """Print lines without a style, or in a style of rich such as `yellow`; by default on standard error."""
     for line in lines:
         console.print(line, style=style)

@@ -167,7 +167,7 @@ def find_chains(
     """
     if base is not None and not any(base in joint.carried_by for joint in joints):
         carriers = ", ".join(dict.fromkeys(name for joint in joints for name in reversed(joint.carried_by)))
-        raise BadInput(f"{path}: --base {base}: there is no such body that carries a joint; there are {carriers}")
+        raise BadInput(f"{path}: --base {base}: there is no such body that carries a joint; expected one of {carriers}")
     if tip is not None:
         ends = [place for place, joint in enumerate(joints) if joint.body == tip]
         if not ends:

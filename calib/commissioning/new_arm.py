@@ -209,4 +209,4 @@ def _given_stops(
 def _refuse_other_joints(option: str, given: Mapping[str, object], names: Sequence[str], place: str) -> None:
     for name in given:
         if name not in names:
-            raise BadInput(f"{option} {name}: there is no such joint {place}; there are {', '.join(names)}")
+            raise BadInput(f"{option} {name}: there is no such joint {place}; expected one of {', '.join(names)}")

@@ -194,7 +194,7 @@ class ServiceView:
     ) -> Iterator[tuple[view.HistoryPoint, ...]]:
         names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
-            raise NoSuch(f"there is no joint {joint!r}; there are {', '.join(names)}")
+            raise NoSuch(f"there is no joint {joint!r}; expected one of {', '.join(names)}")
         chosen = reader.chosen(since, until, most)
         for j in range(len(names)) if joint is None else (names.index(joint),):
             for page in reader.pages(chosen):

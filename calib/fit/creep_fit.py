@@ -81,7 +81,7 @@ class CreepFit(FittedCalibration):
             return np.ones(self.arm.n), np.zeros(self.arm.n)
         place = self.slices.get(family_of(parameter))
         if place is None:
-            raise BadInput(f"creep sweeps give no value {parameter!r}; there are {', '.join(VALUES)}")
+            raise BadInput(f"creep sweeps give no value {parameter!r}; expected one of {', '.join(VALUES)}")
         return self.solution.x[place], np.sqrt(np.diag(self.solution.covariance)[place])
 
     def covariance_of(self, wanted: Sequence[tuple[int, Parameter]]) -> Array:

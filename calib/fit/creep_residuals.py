@@ -169,7 +169,7 @@ def disturbed_sweep(
         if size > max(OUTLIER * usual, LEAST_PUSH * rated[joint]) and abs(push) / rated[joint] > most:
             most = abs(push) / rated[joint]
             text = (
-                f"{name}: {rows.sweeps[sweep]}: something pushed by {push:+.2f} N·m at"
+                f"{name}: {rows.sweeps[sweep]}: something pushed the joint with {push:+.2f} N·m at"
                 f" {rows.readings.position[row, joint]:.2f} rad: contact with the surroundings or the arm itself, or a"
                 " cable under tension; the sweep is left out"
             )

@@ -265,8 +265,8 @@ def _report(
             )
         elif len(here) and offset_std[j] > OFFSET_STD * problem.rated[j]:
             reasons[name, "offset"] = (
-                f"it cannot be separated from the gain and is known only to ± {2 * offset_std[j]:.2g} N·m, since"
-                f" torque stays between {here.min():.2f} and {here.max():.2f} N·m"
+                f"the offset cannot be separated from the gain and is known only to ± {2 * offset_std[j]:.2g} N·m,"
+                f" since torque stays between {here.min():.2f} and {here.max():.2f} N·m"
             )
     return FieldFit(names, solved, hysteresis, reasons, problem.residual(columns, solved.x), model, sources)
 

@@ -180,7 +180,7 @@ class SensorFit(FittedCalibration):
             return ""
         point, half = self.attachment
         if np.isnan(point).all():
-            return "where the reference mass hung is not observable"
+            return "the place of the reference mass is not observable"
         place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
         moments = [f"{_triple(mass * point)} kg·m with {mass:g} kg" for mass in self.rows.masses if mass]
         return (

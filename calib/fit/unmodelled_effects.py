@@ -191,20 +191,18 @@ def effect_finding(
     if effect.id == "transmission.spring":
         text = (
             f"{name}: part of the torque is linear in position, {value / gain:+.3g} N·m/rad, and gravity "
-            "does not explain it: does a cable or a spring cross the joint? This part is taken out; its "
-            "pull at 0 rad counts as offset"
+            "does not explain it: does a cable or a spring cross the joint? The fit removes this part, "
+            "but its value at 0 rad counts as offset"
         )
         return FitFinding(name, "spring", value / gain, "N·m/rad", text)
     if effect.each_sweep:
         size = size_of(coefficient)
-        text = (
-            f"{name}: readings differ by {2 * size:.3g} N·m between the two directions of approach; this is taken out"
-        )
+        text = f"{name}: readings differ by {2 * size:.3g} N·m between the directions of approach; the fit removes this"
         return FitFinding(name, "direction", size, "N·m", text)
     if effect.id == "torque.hysteresis":
         text = (
             f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); "
-            "this is taken out"
+            "the fit removes this lag"
         )
         return FitFinding(name, "hysteresis", abs(value), "N·m", text)
     if effect.id == "torque.saturation":

@@ -210,7 +210,7 @@ def _body(model: "mujoco.MjModel", name: str, path: Path, what: str) -> int:
     body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
     if body < 0:
         names = ", ".join(model.body(body).name for body in range(1, model.nbody))
-        raise BadModel(f"{path}: there is no body {name!r} for the {what}; there are {names}")
+        raise BadModel(f"{path}: there is no body {name!r} for the {what}; expected one of {names}")
     return body
 
 

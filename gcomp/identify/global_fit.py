@@ -59,7 +59,7 @@ class GlobalFit:
         """Covariance of these parameters, in this order; raises KeyError if one was not estimated."""
         missing = [name for name in names if name not in self.names]
         if missing:
-            raise KeyError(f"{missing[0]} was not estimated; there are {', '.join(self.names)}")
+            raise KeyError(f"{missing[0]} was not estimated; expected one of {', '.join(self.names)}")
         at = [self.names.index(name) for name in names]
         return self.covariance[np.ix_(at, at)]
 

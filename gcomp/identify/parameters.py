@@ -61,7 +61,7 @@ class Parameters:
         values = {family: np.full(family_size(family, n), float("gain" in family)) for family in FAMILIES}
         for family, value in known.items():
             if family not in FAMILIES:
-                raise BadArray(f"{family} is no parameter family; there are {', '.join(FAMILIES)}")
+                raise BadArray(f"{family} is no parameter family; expected one of {', '.join(FAMILIES)}")
             values[family] = as_array(family, value, (family_size(family, n),))
         return cls(**values)
 
@@ -108,7 +108,7 @@ def prior_vectors(n: int, priors: Mapping[str, Prior]) -> tuple[Array, Array]:
     slices = family_slices(n)
     for family, prior in priors.items():
         if family not in slices:
-            raise BadArray(f"prior on {family}, which is no parameter family; there are {', '.join(FAMILIES)}")
+            raise BadArray(f"prior on {family}, which is no parameter family; expected one of {', '.join(FAMILIES)}")
         size = (family_size(family, n),)
         mean[slices[family]] = as_array(f"mean of the prior on {family}", np.broadcast_to(prior.mean, size), size)
         std[slices[family]] = np.broadcast_to(prior.std, size)

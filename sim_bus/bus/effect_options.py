@@ -37,9 +37,9 @@ def parse_effect(text: str, joints: Sequence[str]) -> list[EffectEntry]:
     if not (colon and second and effect_id and values):
         raise BadInput(f"--effect {text!r}: expected {EFFECT_FORM}")
     if effect_id not in effects():
-        raise BadInput(f"--effect {text!r}: there is no effect {effect_id!r}; there are {', '.join(effects())}")
+        raise BadInput(f"--effect {text!r}: there is no effect {effect_id!r}; expected one of {', '.join(effects())}")
     if joint and joint not in joints:
-        raise BadInput(f"--effect {text!r}: there is no joint {joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"--effect {text!r}: there is no joint {joint!r}; expected one of {', '.join(joints)}")
     given: dict[str, Any] = {"effect": effect_id, **_parameters(text, effect_id, values.split(","))}
     named = [joint] if joint else joints if effects()[effect_id].per_joint else []
     try:

@@ -59,7 +59,7 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
     parts = what.split(":")
     kind = ALL_KINDS.get(parts[0])
     if kind is None:
-        raise BadInput(f"fault {text!r}: there is no fault {parts[0]!r}; there are {', '.join(ALL_KINDS)}")
+        raise BadInput(f"fault {text!r}: there is no fault {parts[0]!r}; expected one of {', '.join(ALL_KINDS)}")
     joint, value = [*parts[1:], "", ""][:2]
     if len(parts) > 3 or bool(joint) != kind.per_joint:
         raise BadInput(
@@ -67,7 +67,7 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
             f"expected {FORM}"
         )
     if joint and joint not in joints:
-        raise BadInput(f"fault {text!r}: there is no joint {joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"fault {text!r}: there is no joint {joint!r}; expected one of {', '.join(joints)}")
     try:
         amount = float(value) if value else math.nan
         instant = float(time) if at else 0.0

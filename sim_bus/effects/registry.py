@@ -41,14 +41,14 @@ def _value(names: Sequence[str], parameter: SimulatedParameter, value: Any) -> A
 
 def _index(names: Sequence[str], joint: Any) -> int:
     if joint not in names:
-        raise ValueError(f"there is no joint {joint!r}; there are {', '.join(names)}")
+        raise ValueError(f"there is no joint {joint!r}; expected one of {', '.join(names)}")
     return list(names).index(joint)
 
 
 def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]) -> None:
     """Check one effect's id, joint and parameters. Raises ValueError with what was expected."""
     if effect_id not in _EFFECTS:
-        raise ValueError(f"there is no effect {effect_id!r}; there are {', '.join(_EFFECTS)}")
+        raise ValueError(f"there is no effect {effect_id!r}; expected one of {', '.join(_EFFECTS)}")
     effect = _EFFECTS[effect_id]
     if effect.per_joint and joint is None:
         raise ValueError(f"{effect_id}: key `joint` is missing: name the joint that has this effect")

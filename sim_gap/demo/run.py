@@ -311,7 +311,7 @@ class Demo:
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
         if isinstance(fit, CreepFit):
-            swept = "moved slowly through its range without, with and again without"
+            swept = "moved slowly through its range in three passes, without, with and again without"
             friction = {name: _estimate(fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=[each.text for each in fit.findings], sag=None)

@@ -164,7 +164,7 @@ def _body(model: Any, name: str, option: str) -> int:
     body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
     if body < 0:
         names = ", ".join(model.body(each).name for each in range(1, model.nbody))
-        raise BadInput(f"--{option} {name}: the model has no such body; there are {names}")
+        raise BadInput(f"--{option} {name}: the model has no such body; expected one of {names}")
     return body
 
 

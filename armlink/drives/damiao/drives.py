@@ -99,7 +99,7 @@ class DamiaoSettings(DriveSettings):
     def _is_known(cls, label: str) -> str:
         model = model_on_label(label)
         if label and model is None:
-            raise ValueError(f"Damiao model {label!r} is unknown; there are {', '.join(MODELS)} (or leave `model` out)")
+            raise ValueError(f"Damiao model {label!r} is unknown; expected {', '.join(MODELS)} (or leave `model` out)")
         return model or ""
 
     @property
@@ -249,7 +249,7 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         notes = (
             f"torque constant {constant:g} N·m/A"
             if constant
-            else "the torque constant register reads 0, whose meaning is unknown",
+            else "the register of the torque constant reads 0, so the torque constant is unknown",
             f"gear {values[DamiaoRegister.GEAR_RATIO]:g}",
             f"current limit {values[DamiaoRegister.OVER_CURRENT] * values[DamiaoRegister.LARGEST_CURRENT]:g} A",
         )

@@ -365,7 +365,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     return [
         FoundDrive("odrive", node, f"node {node}", {"node": node}, note="gear 1 assumed: torques are the motor's")
         if node < 0x3F
-        else FoundDrive("odrive", node, f"node {node}", wrong="an axis without a node id: set axis0.config.can.node_id")
+        else FoundDrive("odrive", node, f"node {node}", wrong="the axis has no node id: set axis0.config.can.node_id")
         for node, real in sorted(beats.items())
         if len(real) > 1 and all(real) and node not in others
     ]

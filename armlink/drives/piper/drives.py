@@ -151,8 +151,8 @@ class PiperDrives(MitDrives[PiperMemory]):
                 )
             if known.state is not None and known.state & PiperState.ENABLED:
                 raise Refused(
-                    f"{self.names[joint]}: it has power: another host drives the arm, or its host died and the drives "
-                    "still hold it: support the arm, which falls without power, then switch its power off and on"
+                    f"{self.names[joint]}: the arm has power: another host drives the arm, or a host died and the "
+                    "drives still hold it: support the arm, which falls without power, then switch its power off and on"
                 )
         return super().set_up(ask, limits)
 
@@ -280,7 +280,7 @@ class PiperDrives(MitDrives[PiperMemory]):
     def own_stop(self, joint: int) -> str:
         if not self.memory[joint].stopped:
             return ""
-        return f"{self.where(joint)}: no command came within the deadline, so its keeper holds it"
+        return f"{self.where(joint)}: no command came within the deadline, so the keeper holds the joint"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)

@@ -38,7 +38,7 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
 def rewire(
     model: Path, out: Path, bus: str, ask: "Ask | None", *, by_ids: bool, bundled: bool, json: Path | None
 ) -> int:
-    """An arm file with the drives of a bus; `by_ids`: each is asked who it is by the id in the file.
+    """An arm file with the drives of a bus; `by_ids`: each drive is asked for its identity at its id in the file.
 
     A copy of a `bundled` arm takes the serial number of its first drive.
     """

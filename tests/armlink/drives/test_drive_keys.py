@@ -49,7 +49,7 @@ def test_a_torque_sensor_at_an_input_of_the_device(tmp_path):
         (drive(family="canopen", node=200), "key link.joints.0.drive.node: Input should be less than or equal to 127"),
         (
             drive(family="stepper", node=1),
-            "key link.joints.0.drive: drive family 'stepper' is unknown; there are canopen",
+            "key link.joints.0.drive: drive family 'stepper' is unknown; expected one of canopen",
         ),
         (drive(node=1), "key link.joints.0.drive: expected a mapping with the key `family`"),
         (drive(family="canopen", node=1, torque="motor", calibration="controller"), "`calibration: controller` needs"),
@@ -90,6 +90,6 @@ def test_a_label_is_known_however_it_is_printed(label, model):
 
 
 def test_an_unknown_label_is_refused_with_those_there_are():
-    with pytest.raises(ValidationError, match=r"Damiao model 'DM-J9999P-2EC' is unknown; there are DM3507, DM4310"):
+    with pytest.raises(ValidationError, match=r"Damiao model 'DM-J9999P-2EC' is unknown; expected DM3507, DM4310"):
         DamiaoSettings(id=1, reply=0x11, model="DM-J9999P-2EC", kp=10, kd=1)
     assert DamiaoSettings(id=1, reply=0x11, kp=10, kd=1).model == ""

@@ -111,7 +111,7 @@ def test_answers_that_come_late_are_answers():
     results = self_test(SimulatedArm(arm, Truth.of(arm), 1), bus=LateBus)
     for joint in ("hinge_1", "hinge_2"):
         assert results[joint, "answers SYNC"].outcome == "passed"
-        assert re.search(r"(\d+) of \1 cycles answered, 1\d of them late", results[joint, "answers SYNC"].found)
+        assert re.search(r"replies came in (\d+) of \1 cycles, 1\d of them late", results[joint, "answers SYNC"].found)
 
 
 def test_the_joints_do_not_move(simulated):

@@ -166,7 +166,7 @@ def test_the_models_own_moments_are_those_with_the_tool_of_the_arm_file(bench):
     ("options", "said"),
     [
         ("poses.csv --model none.urdf", "there is no model file none.urdf"),
-        ("poses.csv --model sarcos --tip hand", "only for a URDF or MJCF file"),
+        ("poses.csv --model sarcos --tip hand", "--base and --tip need a URDF or MJCF file"),
         ("none.csv --model arm.xml", "none.csv"),
         ("still.csv --model arm.xml", "no torque"),
         ("three.csv --model arm.xml", "3 joints"),
@@ -181,8 +181,8 @@ def test_the_models_own_moments_are_those_with_the_tool_of_the_arm_file(bench):
         ("poses.csv --model sarcos --out-model x.urdf", "--out-model"),
         ("poses.csv --model arm.xml --effort-is without-gravity", "the efforts do not contain gravity"),
         ("poses.csv --model arm.xml --arm sarcos", "only for sweeps"),
-        ("poses.csv --plan 3", "--plan: only for poses"),
-        ("poses.csv --gain-std 0", "--gain-std: only for poses"),
+        ("poses.csv --plan 3", "--plan is only for poses"),
+        ("poses.csv --gain-std 0", "--gain-std is only for poses"),
     ],
 )
 def test_a_bad_input_is_one_clear_line(bench, capsys, options, said):

@@ -74,7 +74,7 @@ def test_one_joint_that_gravity_acts_on_does_not_tell_its_gain_nor_where_the_mas
     assert {key for key in fit.reasons if key[1] == "gain"} == {("j1", "gain"), ("j2", "gain")}
     assert fit.attachment is not None
     assert np.isnan(fit.attachment[0]).all()
-    assert fit.attachment_text == "where the reference mass hung is not observable"
+    assert fit.attachment_text == "the place of the reference mass is not observable"
 
 
 def test_a_single_joint_tells_its_gain_once_it_is_known_where_the_mass_hangs() -> None:
@@ -96,7 +96,7 @@ def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> N
     truth, data = passes(arm, 2)
     bare, plan = fit_sensors(arm, data), data[0].plan
     assert plan is not None
-    assert "gains will be known to" in plan.notes[-1]
+    assert "gains will be known only to" in plan.notes[-1]
     assert set(bare.imprecise) == {"j1", "j2", "j3"}
     assert "measure where the reference mass hangs" in bare.imprecise["j1"]
     assert np.abs(scores(bare, truth)[0]).max() < 2

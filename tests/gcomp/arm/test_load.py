@@ -180,7 +180,7 @@ def test_branches_unknown_tips_and_files_that_are_no_models_are_refused(tmp_path
     with pytest.raises(BadModel, match="joint left is on a side branch: name the last body of the chain"):
         load_model(path)
     assert load_model(path, tip="a").arm.names == ("left",)
-    with pytest.raises(BadModel, match="no body 'c' for the tip; there are a, b"):
+    with pytest.raises(BadModel, match="no body 'c' for the tip; expected one of a, b"):
         load_model(path, tip="c")
     path.write_text("q_1,q_2\n0,1\n")
     with pytest.raises(BadModel, match="not a URDF or MJCF file"):

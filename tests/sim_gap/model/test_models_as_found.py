@@ -92,7 +92,7 @@ def test_an_arm_is_chosen_by_its_ends(two_arms):
 @pytest.mark.parametrize(
     ("base", "tip", "says"),
     [
-        ("chest", None, "--base chest: the model has no such body; there are lift, torso, left_upper"),
+        ("chest", None, "--base chest: the model has no such body; expected one of lift, torso, left_upper"),
         ("left_upper", "right_lower", "the base body does not carry the tip body"),
         ("right_lower", None, "no hinge between these bodies"),
     ],

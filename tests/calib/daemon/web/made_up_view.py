@@ -187,7 +187,7 @@ class MadeUpView:
         if joint is None:
             return tuple(point for name in NAMES for point in self.history(name, since, until, most))
         if joint not in NAMES:
-            raise NoSuch(f"no joint {joint!r}; there are {', '.join(NAMES)}")
+            raise NoSuch(f"no joint {joint!r}; expected one of {', '.join(NAMES)}")
         points = [point for point in self.points if point.joint == joint]
         points = [p for p in points if (since is None or p.time >= since) and (until is None or p.time <= until)]
         return tuple(points[:: max(1, math.ceil(len(points) / most))])
