@@ -74,7 +74,7 @@ def _no_command(name: str, points: dict[str, EntryPoint]) -> str:
         return f"there is no command {name!r}; to make an arm file from a model, use `armlink new {name}`"
     close = difflib.get_close_matches(name, [*points, "--help", "--version", "completion"], n=1)
     hint = f"did you mean {close[0]}? " if close else ""
-    return f"there is no command {name!r}; {hint}there are {', '.join(sorted(points))}"
+    return f"there is no command {name!r}; {hint}the commands are {', '.join(sorted(points))}"
 
 
 def _call(point: EntryPoint, arguments: list[str]) -> int:
@@ -161,7 +161,7 @@ def _help(points: dict[str, EntryPoint]) -> str:
     completed = "armlink completion bash|zsh|fish prints the script for completion in the shell."
     return (
         f"Usage: armlink COMMAND [OPTIONS]\n\n{_in_terminal(sys.stdout, PURPOSE)}\n\nCommands:\n{rows}\n\nOptions:\n"
-        f"  --help     Shows this, and armlink COMMAND --help says more.\n"
+        f"  --help     Shows this help; for a command: COMMAND --help.\n"
         f"  --version  Shows the version, {version('armlink')}.\n\n"
         f"{_in_terminal(sys.stdout, completed)}\n\nExample: armlink demo --seed 1\n"
     )

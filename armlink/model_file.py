@@ -134,7 +134,7 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
         if weighed and kind == "MJCF":
             raise BadInput(
                 f"{path}: mesh {mesh.file} is {reason}, and body {weighed[0]!r} has its mass from this mesh "
-                "alone: put a mesh that MuJoCo reads beside the model, or give the body an `inertial`"
+                "alone: put a mesh that MuJoCo can read next to the model, or give the body an `inertial`"
             )
         _drop(spec, mesh)
     for texture in list(spec.textures):

@@ -23,7 +23,7 @@ class ArmWork:
 def early_end(arm: ArmFile, resume: str | Callable[[], str] | None = None) -> Iterator[ArmWork]:
     """After Ctrl-C or a stall, print how the joints were left and how to continue, once the link inside is closed.
 
-    Entered before the link is opened; `resume` is the command that continues the work, or tells it then.
+    Enter it before the link is opened; `resume` is the command that continues the work, or a function that returns it.
     """
     work = ArmWork()
     try:

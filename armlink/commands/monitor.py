@@ -48,7 +48,7 @@ def monitor(
 ) -> int:
     """Show what an arm's joints send; exit status 3 if no joint is heard.
 
-    It listens beside the host that runs the arm. Torque is scaled by the arm file's rated torques, position by 2^20
+    It listens while a host runs the arm. Torque is scaled by the arm file's rated torques, position by 2^20
     units a turn. With --stats the interface's time stamps are used (with --sync, the monitor's clock); latency is the
     time from SYNC to the reading of the last joint, and the load includes stuff bits. With --foxglove 8765 open
     ws://localhost:8765 in Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun

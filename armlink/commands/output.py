@@ -11,7 +11,7 @@ from armlink.content.printable_text import printable_json
 
 
 def write_json(path: Path | None, answer: Any) -> None:
-    """Write `answer` as JSON to `path` (`-`: standard output, None: nowhere); numbers not finite become null."""
+    """Write `answer` as JSON to `path` (`-`: standard output, None: nowhere); NaN and infinity become null."""
     if path is None:
         return
     text = printable_json(_finite(answer), indent=1, allow_nan=False) + "\n"
@@ -23,7 +23,7 @@ def write_json(path: Path | None, answer: Any) -> None:
 
 @contextmanager
 def json_lines(path: Path | None) -> Iterator[Callable[[Any], None]]:
-    """A function that writes one answer as a line at once, to `path` as `write_json` has it."""
+    """A function that writes an answer as one line, without delay; `path` is that of `write_json`."""
     if path is None:
         yield lambda answer: None
     elif str(path) == "-":
@@ -42,7 +42,7 @@ def _line(answer: Any) -> str:
 
 
 def write_out(text: str) -> None:
-    """Write text for machines, printable already, to standard output."""
+    """Write text for programs, which is printable already, to standard output."""
     import typer
 
     typer.echo(text, nl=False)

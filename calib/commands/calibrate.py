@@ -28,7 +28,7 @@ def calibrate(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Write this joint although the sensor model does not hold for it; may be repeated.",
+            help="Write the values of this joint although the sensor model does not hold for it; may be repeated.",
             rich_help_panel=APPLY,
         ),
     ] = None,

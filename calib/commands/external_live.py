@@ -37,7 +37,7 @@ LINE_SECONDS = 1.0
 def follow(
     arm: "ArmFile", source: str | None, learned: "Learned", seconds: float, json_file: Path | None, foxglove: int | None
 ) -> None:
-    """Tell until the time is over or Ctrl-C. Raises BusFault if nothing is heard, or no torque of the learned kind."""
+    """Report until the time is over or Ctrl-C. Raises BusFault if no torque of the learned kind is heard."""
     live, out = LiveExternal(learned), results(json_file)
     with (
         json_lines(json_file) as write,

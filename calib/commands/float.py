@@ -47,7 +47,7 @@ def hold_afloat(
     arm_file = with_tool(load_arm(arm), tool)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
-    unasked = confirm(f"Only its gravity model will hold {arm_file.name}", "Do you hold it with your hand?", yes)
+    unasked = confirm(f"Only the gravity model will hold {arm_file.name}", "Do you hold the arm with your hand?", yes)
     resume = command_line("float", arm, bus=bus, record=record, tool=tool, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()

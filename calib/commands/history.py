@@ -26,7 +26,7 @@ def history(
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """List the records of an arm, oldest first, what became current and what was written to drives.
+    """List the records of an arm (oldest first), and which records became current or were written to drives.
 
     Example: armlink history sarcos --json -
     """

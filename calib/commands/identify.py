@@ -87,7 +87,7 @@ def identify(
     of_poses = PoseOptions(base, tip, masses, held, gain_std, out_model, coefficients, plan)
     if model is not None:
         if arm is not None or calibration is not None:
-            raise BadInput("--arm, --calibration: only for sweeps; poses need only --model")
+            raise BadInput("--arm and --calibration are only for sweeps; poses need only --model")
         return identify_poses(data, model, of_poses, stated, records, json_file)
     of_poses.require_none()
     sweeps, arm_file = load_sweeps(data, arm)

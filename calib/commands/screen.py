@@ -97,7 +97,7 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
     """Say what will move and ask a person at the terminal, unless it was `agreed` before; raises Declined where the
     answer is no.
 
-    Without a terminal nobody is asked: the lines that say so, for the moment before it moves.
+    Without a terminal nobody is asked, and the lines returned say so: print them just before the arm moves.
     """
     if agreed:
         return []

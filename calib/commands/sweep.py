@@ -206,7 +206,7 @@ def _show(
 
 
 def next_step(data: "SweepData", again: list[str]) -> tuple[str, list[str]]:
-    """The next step after this pass, in a sentence and in words of a command; `again` is that of another pass."""
+    """Next step after this pass, as a sentence and as a command in words; `again` is the command of another pass."""
     from calib.dataset import earlier_passes, new_folder
 
     assert data.plan is not None

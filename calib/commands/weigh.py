@@ -16,7 +16,7 @@ def weigh(
     arm: Arm,
     bus: OtherBus = None,
     poses: Annotated[int, typer.Option(min=4, max=200, help="Number of poses to drive to.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses that are chosen from.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random choice of poses.")] = 0,
     store: Store = None,
     keep_going: KeepGoing = 0,
     yes: WithoutAsking = False,

@@ -276,7 +276,7 @@ def _no_gain(torque: Array) -> str:
     if np.abs(torque).max() < 1e-3:
         return "gravity does not load this joint, since its axis is vertical in all these poses"
     return (
-        f"it cannot be separated from the offset, since gravity torque varies only by {spread:.2g} N·m "
+        f"the gain cannot be separated from the offset, since gravity torque varies only by {spread:.2g} N·m "
         "(standard deviation) in these poses: move this joint, or the joints beyond it, further"
     )
 

@@ -283,7 +283,7 @@ def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Param
 def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
     if name in fit.hopeless:
         spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
-        return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads it in these poses"
+        return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads the joint in them"
     for sentence in fit.null_space:
         if name in sentence:
             if "common factor" in sentence and not any(rows.masses):

@@ -124,7 +124,7 @@ def play(values: Array, half: Array) -> Array:
 
 UNITS = {
     "axes": (6e-4, "rad"),
-    "upright": (6e-4, "rad, of a moment that no reading of the joints across shows"),
+    "upright": (6e-4, "rad, of a mass moment that gravity would not show otherwise"),
     "eccentricity": (2.2e-4, "rad"),
     "sag": (3e-4, "rad at rated torque"),
     "crosstalk": (2.5e-3, "1"),

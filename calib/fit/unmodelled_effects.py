@@ -215,7 +215,7 @@ def effect_finding(
         size = float(np.hypot(*coefficient))
         text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
         return FitFinding(name, "eccentricity", size, "rad", text)
-    text = f"{name}: the torque sensor's gain changes with the load (by {2 * value / gain:+.2%} at the largest)"
+    text = f"{name}: the torque sensor's gain changes with the load (by {2 * value / gain:+.2%} at the largest load)"
     return FitFinding(name, "nonlinear", value / gain, "1", text)
 
 

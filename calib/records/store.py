@@ -287,7 +287,7 @@ def way_to(arm: ArmFile, *kinds: str, listen_only: bool = False) -> str:
     made = " and ".join(MAKERS[kind] for kind in kinds)
     way = f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"
     if listen_only:
-        return f"name the store that has them with `--store`, or stop the program that commands the arm, then {way}"
+        return f"give the store that has them as `--store`, or stop the program that commands the arm, then {way}"
     return way
 
 

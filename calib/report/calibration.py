@@ -95,18 +95,18 @@ def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
         half[np.isfinite(half)],
         [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
     )
-    exactly = f"Torque gain intervals: ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
+    exactly = f"Intervals of gains: ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
     without = f"; the gains of {', '.join(unknown)} are not known, see below" if unknown else ""
     if broken:
         return paragraph(
-            f"Do not write it to the drives yet: look at {', '.join(broken)} first, then sweep again. "
+            f"Do not write this calibration to the drives yet: look at {', '.join(broken)} first, then sweep again. "
             f"{exactly}{without}."
         )
     if done.record.confirmed_by:
-        next_step, command = "It is confirmed for the drives; verify it with:", f"armlink verify {done.arm.argument}"
+        next_step, command = "This calibration is confirmed. Verify it with:", f"armlink verify {done.arm.argument}"
     else:
         sweeps = shlex.join(str(data.path) for data in done.data)
-        next_step, command = "It can be written to the drives with:", f"armlink calibrate {sweeps} --apply"
+        next_step, command = "To write this calibration to the drives, run:", f"armlink calibrate {sweeps} --apply"
     return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 

@@ -30,7 +30,7 @@ def bench(
         _other("Diagnose instead the recordings of real arms in this folder; see --known.", metavar="DIR"),
     ] = None,
     known: Annotated[
-        Path | None, _other("YAML file with the known effects of these arms; by default of the published arms.")
+        Path | None, _other("YAML file with the known effects of these arms; by default the published arms.")
     ] = None,
     json: Json = None,
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,

@@ -84,8 +84,8 @@ def diagnose(
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and beside it a "
-            "Python module for effects that the format cannot express."
+            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf). Effects that the "
+            "format cannot express are written to a Python module in the same folder."
         ),
     ] = None,
 ) -> None:

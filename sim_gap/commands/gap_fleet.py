@@ -33,7 +33,7 @@ def diagnose_fleet(
         typer.Option(help="File of results, one JSON line each; cases that are already in this file are not repeated."),
     ] = None,
     table: Annotated[
-        Path | None, typer.Option(help="Also write a table by case and effect to this file (.parquet).")
+        Path | None, typer.Option(help="Also write a table, one row per case and effect (.parquet).")
     ] = None,
     json: Json = None,
     base: Base = None,

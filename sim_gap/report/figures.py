@@ -158,7 +158,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
     chosen = _drawn_samples(data.valid[row])
     x, figure = along(data, quantity)[chosen, j], go.Figure()
     left = (data.values[row] - whole[row] + own[row])[chosen]
-    _add_points(figure, x, left, GREY, "residual less the other causes")
+    _add_points(figure, x, left, GREY, "residual minus the other causes")
     _add_points(figure, x, own[row][chosen], ORANGE, cause.effect)
     title = f"{cause.effect} at {answer.names[j]}" + (" (example)" if len(cause.joints) > 1 else "")
     return _labelled(figure, title, quantity, channel, answer.names[j])

@@ -22,7 +22,7 @@ SUFFIXES = (".eds", ".dcf")
 MOST_ENTRIES = 254
 """Largest sub-index of an array (CiA 301: 255 has another use)."""
 OPTIONAL = {
-    object_dictionary.TORQUE_OFFSET: "torque offset: the device has no torque offset that would have to be cleared",
+    object_dictionary.TORQUE_OFFSET: "torque offset: the device has none, so nothing has to be cleared",
     object_dictionary.PROFILE_VELOCITY: "profile velocity: the device has no profile position mode",
     object_dictionary.TORQUE_SLOPE: "torque slope: the device has no profile torque mode",
     object_dictionary.STORE_MANUFACTURER: "store: the device loses its calibration at power-off",

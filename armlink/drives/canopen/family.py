@@ -36,5 +36,5 @@ FAMILY = Family(
     discovery=Discovery(_late("check.scan", "FoundNodes"), ("moteus", "odrive")),
     examine=_late("check.scan", "arm_findings"),
     state_name=state_name,
-    summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",
+    summary="CiA 402 (CANopen), with or without armlink's object 2100h",
 )

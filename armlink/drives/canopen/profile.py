@@ -30,7 +30,7 @@ LOST: Mapping[Entry, str] = {
     objects.RATED_TORQUE: "the rated torque is taken from the arm file",
     objects.SUPPORTED_MODES: "only the mode display shows which modes the device supports",
     objects.MODE_DISPLAY: "only the motion of the joint shows that the device refused a mode",
-    objects.TORQUE_OFFSET: "the device has no torque offset that would have to be cleared",
+    objects.TORQUE_OFFSET: "the device has no torque offset, so nothing has to be cleared",
     objects.PROFILE_VELOCITY: "no profile position mode",
     objects.TORQUE_SLOPE: "no profile torque mode",
 }

@@ -272,7 +272,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
     def own_stop(self, joint: int) -> str:
         if self.memory[joint].mode != frames.MoteusMode.TIMEOUT:
             return ""
-        return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
+        return f"{self.where(joint)}: its watchdog ran out: it damps the motion until it is stopped (mode 11)"
 
     # ---- listening
 

@@ -147,7 +147,7 @@ class PiperDrives(MitDrives[PiperMemory]):
             if firmware not in ("", settings.firmware):
                 raise Refused(
                     f"{self.names[joint]}: the arm's firmware is {firmware}, the arm file states {settings.firmware}: "
-                    "correct it, since the scale of torques depends on it"
+                    "correct `firmware`, since the scale of torques depends on it"
                 )
             if known.state is not None and known.state & PiperState.ENABLED:
                 raise Refused(

@@ -129,8 +129,8 @@ def search(opened: "CanBus") -> "BusDrives":
 
 
 def bus_keys(bus: str, out: Path, families: set[str]) -> dict[str, Any]:
-    """Keys of link.bus for a bus given on the command line, with drives of these families; the arm file of a simulated
-    one relative to `out`."""
+    """Keys of link.bus for a bus given on the command line, with drives of these families; for a simulated bus, the
+    path of its arm file is relative to `out`."""
     import os
 
     from armlink.bus.open import parse_bus

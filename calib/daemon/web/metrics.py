@@ -27,7 +27,7 @@ JOINT = (
     ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful only at rest."),
     ("temperature", "joint_temperature_celsius", "Temperature of the drive, if it reports one."),
     ("external_torque", "joint_external_torque_newton_metres", "Torque with which the surroundings push the joint."),
-    ("external_bound", "joint_external_bound_newton_metres", "Half width of its 95 % interval."),
+    ("external_bound", "joint_external_bound_newton_metres", "Half width of the 95 % interval of this torque."),
     ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
