@@ -130,7 +130,7 @@ def test_an_arm_with_power_is_not_set_up_since_it_would_fall():
     bench = Bench("six-piper")
     bench.set_up()
     assert bench.walk()
-    with pytest.raises(Refused, match=r"base: it has power: .* support the arm"):
+    with pytest.raises(Refused, match=r"base: the arm has power: .* support the arm"):
         Bench.set_up(bench)
     assert all(bench.powered)
 

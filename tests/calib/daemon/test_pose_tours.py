@@ -136,7 +136,7 @@ def test_an_arm_that_touches_something_stays_where_it_is_and_the_bodies_are_name
     daemon.choose()
     (refused,) = daemon.said
     assert refused[0] == "refused"
-    assert "no pose is reached" in refused[2]
+    assert "reaches no pose" in refused[2]
     assert "post" in refused[2]
     assert daemon.tours.progress is None
     assert len(daemon.moved[-1].tour) == 0

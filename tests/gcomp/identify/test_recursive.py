@@ -70,7 +70,7 @@ def test_two_angles_do_not_determine_a_moment(sarcos, rng) -> None:
 def test_a_joint_without_a_sweep_and_loaded_rows_are_refused(sarcos) -> None:
     torque = np.zeros((5, 7))
     torque[:, 3] = np.nan
-    with pytest.raises(BadArray, match="joint joint_4: no torque reading of this joint counts"):
+    with pytest.raises(BadArray, match="joint joint_4: this joint has no usable torque reading"):
         identify_recursive(sarcos, StaticReadings.of(np.random.default_rng(0).normal(size=(5, 7)), torque, 0.05))
     with pytest.raises(BadArray, match="unloaded readings only"):
         identify_recursive(sarcos, StaticReadings.of(np.zeros((5, 7)), torque, 0.05, 2.0))
