@@ -199,7 +199,10 @@ def test_records_alone_bound_what_they_know(workplace, monkeypatch, capsys):
         ("arm.xml quiet.csv --frame j9", "one of the joints j1, j2, j3"),
         ("arm.xml quiet.csv --frame j2,1", "JOINT,X,Y,Z"),
         ("arm.xml quiet.csv --out out.txt", "out.txt"),
-        ("arm.xml --picture felt.svg --baseline free_1.csv --out out.csv", "--out out.csv: this option needs recordings"),
+        (
+            "arm.xml --picture felt.svg --baseline free_1.csv --out out.csv",
+            "--out out.csv: this option needs recordings",
+        ),
         ("arm.xml short.csv --baseline free_1.csv", "short.csv: it has no 1 s without missing rows"),
         ("arm.xml quiet.csv --baseline short.csv", "--baseline: no recording has 1 s without missing rows"),
         ("none.xml quiet.csv", "none.xml"),
