@@ -13,7 +13,6 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.plan.collisions import Collided, straight_way, sweep_ends
-from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.planned_arm import SLOWEST, PlannedArm, nearest_first
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments, stop_combinations, with_lever
@@ -365,7 +364,9 @@ def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sw
     joint, stops = options.joint, options.stops[pick]
     steps = np.linspace(*planned.sweep_range(joint), section.steps)
     servo, bias, acceleration = _hold(planned, options.kept(np.arange(options.count) == pick))
-    rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
+    low, high = planned.ends
+    pressed = np.where(stops > 0, limits.upper, limits.lower)
+    rest = np.where(servo, np.where(stops > 0, high, low), pressed)
     rest[joint] = steps[0]
     return Sweep(
         name=name,
