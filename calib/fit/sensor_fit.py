@@ -193,7 +193,11 @@ class SensorFit(FittedCalibration):
         """Joint → why its gain, though determined, is less precise than `WIDE`."""
         half = self.half95("gain") / np.abs(self.value("gain"))
         common = bool(np.all(half[np.isfinite(half)] > WIDE))
-        why = COMMON if common else "use more poses in its sweeps, or a heavier reference mass"
+        why = (
+            COMMON
+            if common
+            else "use more poses in its sweeps, or a reference mass that is heavier or hangs farther from its axis"
+        )
         return {
             name: f"{name} gain: it is known only to ± {width:.1%}: {why}"
             for name, width in zip(self.names, half, strict=True)

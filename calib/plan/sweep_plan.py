@@ -250,9 +250,9 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"even with long averages, gains will be known to ± {200 * gain_std / finer:.2g} % only instead "
-            f"of ± {200 * goal:.2g} %: use a heavier reference mass or more sweep.poses, or measure where "
-            "the mass hangs (sweep.reference_point)"
+            f"the worst gain will be known to about ± {200 * gain_std / finer:.2g} %, although ± {200 * goal:.2g} % is "
+            "asked for (sweep.gain_std in the arm file): go on, or use a heavier reference mass, more sweep.poses, or "
+            "measure where the mass hangs (sweep.reference_point)"
         )
     return SweepPlan(
         sweeps=sweeps,

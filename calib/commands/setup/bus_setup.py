@@ -87,6 +87,10 @@ def _tell(
     show_findings(console, findings)
     step = command_line(*first_check(arm, str(out)))
     console.print(f"{out} is written with {len(matches)} drives: {addresses([each.drive for each in matches])}{more}")
+    if not all(each.by_hand for each in matches):
+        console.print(
+            "joints took the drives in the order of their ids, which is assumed: --by-hand tells whose is which"
+        )
     suggest(step)
     joints = [
         {"name": each.joint, "node": each.drive.node, "by_hand": each.by_hand}
