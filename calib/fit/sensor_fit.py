@@ -290,6 +290,8 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
         return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads it in these poses"
     for sentence in fit.null_space:
         if name in sentence:
+            if sentence.startswith(f"{name} changes no reading"):
+                return "gravity does not act on this joint in these poses, as with a vertical axis"
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
             remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
