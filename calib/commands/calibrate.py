@@ -96,6 +96,8 @@ def calibrate(
     )
     again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
     kept = "the drives keep their old calibration until `--apply` writes this record to them"
+    if arm_file.serial == "unknown":
+        kept += ", which needs the arm's serial number in the arm file"
     if not isinstance(fit, SensorFit):
         with early_end(arm_file, again) as work:
             work.enabled = apply and check

@@ -63,7 +63,8 @@ def history(
         }
         for kept in records.history(arm_file)
     ]
-    title = f"{arm_file.name} {arm_file.serial} in {records.url}"
+    serial = "without a serial number" if arm_file.serial == "unknown" else arm_file.serial
+    title = f"{arm_file.name} {serial} in {records.url}"
     _print(title, rows, log, writes, results(json_file))
     if not rows:
         suggest(command_line("sweep", arm, "--plan"))

@@ -143,3 +143,5 @@ def _show(fit: "GravityFit", console: "PlainConsole") -> None:
         columns["y, recursive"] = recursive[1::2], 0 * half[1::2]
     columns["residual [N·m]"] = fit.residual_rms, 0 * fit.residual_rms
     print_intervals("Mass moments [kg·m], ± half of the 95 % interval", fit.names, columns, console)
+    if fit.recursive is not None:
+        console.print("recursive: one joint after the other, from tip to base, for comparison; x and y are the result")

@@ -109,12 +109,15 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
     """Print the findings of the pre-flight, one row per joint."""
-    measured = ("torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop [rad]", "upper stop [rad]")
-    table = Table("joint", *measured, title="Pre-flight")
+    measured = ["torque noise [N·m]", "torque at rest [N·m]", "drive [°C]"]
+    pushed = np.isfinite(found.stops).any()
+    table = Table("joint", *measured, *(["lower stop [rad]", "upper stop [rad]"] if pushed else []))
+    table.title = "Before the first reading"
     for joint, name in enumerate(found.names):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
             for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
+            if pushed
         ]
         warm = "not reported" if np.isnan(found.temperature[joint]) else f"{found.temperature[joint]:.0f}"
         table.add_row(name, f"{found.noise[joint]:.3g}", f"{found.torque[joint]:.3g}", warm, *stops)

@@ -37,11 +37,14 @@ def sweep(
         ),
     ] = None,
     check_stops: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            help="Before the pass without load, push every joint slowly onto both of its stops.", rich_help_panel="Run"
+            "--check-stops/--no-check-stops",
+            help="Before the pass without load, push every joint slowly onto both of its stops; by default only where "
+            "joints rest on their stops (--hold stops).",
+            rich_help_panel="Run",
         ),
-    ] = True,
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -72,7 +75,7 @@ def sweep(
     from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.api import open_link
-    from calib.arm.sweep_section import sweep_motion, with_hold
+    from calib.arm.sweep_section import sweep_motion, sweep_section, with_hold
     from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines, warn_late
     from calib.commissioning.model_checks import refuse_impossible_sweep
     from calib.dataset import MANIFEST, new_folder, require_vacant
@@ -121,7 +124,8 @@ def sweep(
             link.enable()
             on_stall = screen.on_stall(keep_going)
             found = heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
-            if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
+            wanted = sweep_section(arm_file).hold == "stops" if check_stops is None else check_stops
+            if wanted and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
                 pushed = partial(screen.count, what="stops, each touched by its joint")
                 found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
             data = run_sweep(
@@ -163,10 +167,14 @@ def _plan(
         planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
         took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
-        before = f"{_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
-        if sweep_section(arm_file).hold == "servo":
-            before += " (`--no-check-stops` leaves this out, as for a joint without stops)"
-        told = f"about {_minutes(took)} for each pass, {before}; {checked}{drawn}"
+        told = f"about {_minutes(took)} for a pass"
+        if sweep_section(arm_file).hold == "stops":
+            told += (
+                f", {_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
+            )
+        told += f"; {checked}{drawn}"
+        if not reference_mass:
+            told += "; the pass begins with a rough gravity model, and may then take other poses, which are checked too"
     print_plan(arm_file, planned, console)
     if picture is not None:
         draw_plan(arm_file, planned, picture)
@@ -227,7 +235,8 @@ def next_step(data: "SweepData", again: list[str]) -> tuple[str, list[str]]:
     mass = f"{data.plan.reference_mass:g}"
     name = data.path.name
     name = name.replace("unloaded", "loaded") if "unloaded" in name else f"{name}-loaded"
-    return f"now attach {mass} kg and sweep again", another(name, "--reference-mass", mass)
+    attach = f"now attach {mass} kg, or less if the arm carries less, away from the last joint's axis, and sweep again"
+    return attach, another(name, "--reference-mass", mass)
 
 
 def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:

@@ -67,7 +67,11 @@ def verify(
             result = run_verify(
                 link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
             )
-    _show(result, results(json_file))
+    out = results(json_file)
+    _show(result, out)
+    untold = [] if calibration is None else [each.name for each in calibration.joints if each.gain is None]
+    if untold:
+        out.print(f"the torque gain of {', '.join(untold)} was not verified, since the calibration has none")
     if result.passed:
         suggest(command_line("daemon", arm, bus=bus, store=store))
     if report is not None:

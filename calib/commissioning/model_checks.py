@@ -13,7 +13,7 @@ from armlink.arm_file import ArmFile
 from armlink.drives.findings import SetupFinding
 from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
-from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
+from armlink.model_file import FLAT, NOT_FOUND, UNFETCHED, read_model
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
 from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.plan.collisions import check_plan
@@ -238,6 +238,8 @@ def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             )
         elif UNFETCHED in reasons:
             remedy = "run `git lfs pull` in the folder where the model was cloned"
+        elif reasons == {FLAT}:
+            remedy = "replace these meshes by boxes in the model, or keep the workspace clear"
         yield SetupFinding("warning", f"the collision geometry is incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
         yield SetupFinding(

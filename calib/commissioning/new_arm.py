@@ -186,9 +186,11 @@ def _narrow_until_clear(made: NewArm) -> None:
     for lower, upper in clear_ranges(arm_file):
         for joint, low, high in zip(made.draft.joints, lower, upper, strict=True):
             joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
-            joint.notes = [note.replace("to be the limits", "to lie within the limits") for note in joint.notes]
-        made.draft.servo = f"the range under kinematics.stops is narrower than the model's limits ({reason})"
+        made.draft.servo = f"the ranges under kinematics.stops are narrower than the model's limits ({reason})"
         if sweep_problem(made.parsed()) is None:
+            for joint in made.draft.joints:
+                narrowed = [f"{note}; narrowed, so that no sweep collides" for note in joint.notes if "stops" in note]
+                joint.notes = [*narrowed, *(note for note in joint.notes if "stops" not in note)]
             return
     raise problem
 

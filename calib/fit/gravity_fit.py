@@ -135,8 +135,7 @@ def _require_scale(names: tuple[str, ...], lost: Mask) -> None:
     if lost.all():
         raise Refused(
             f"no torque gain of {', '.join(names)} is known, so mass moments are known only up to a common "
-            "factor: sweep with --reference-mass on an arm whose axes do not all meet, or give a calibration "
-            "record"
+            "factor: sweep with --reference-mass on an arm whose axes do not all meet, or give a calibration record"
         )
 
 

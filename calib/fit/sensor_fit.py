@@ -193,7 +193,11 @@ class SensorFit(FittedCalibration):
         """Joint → why its gain, though determined, is less precise than `WIDE`."""
         half = self.half95("gain") / np.abs(self.value("gain"))
         common = bool(np.all(half[np.isfinite(half)] > WIDE))
-        why = COMMON if common else "use more poses in its sweeps, or a heavier reference mass"
+        why = (
+            COMMON
+            if common
+            else "use more poses in its sweeps, or a reference mass that is heavier or hangs farther from its axis"
+        )
         return {
             name: f"{name} gain: it is known only to ± {width:.1%}: {why}"
             for name, width in zip(self.names, half, strict=True)
@@ -286,6 +290,8 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
         return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads the joint in them"
     for sentence in fit.null_space:
         if name in sentence:
+            if sentence.startswith(f"{name} changes no reading"):
+                return "gravity does not act on this joint in these poses, as with a vertical axis"
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
             remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""

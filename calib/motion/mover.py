@@ -339,7 +339,8 @@ class Mover:
         if beyond > 2 * STOP_TOLERANCE + 0.03 * abs(limit):
             raise Refused(
                 f"{self.link.names[joint]}: no stop was found at {limit:.3f} rad (the joint went to "
-                f"{self.position[joint]:.3f} rad): check lower and upper in the arm file"
+                f"{self.position[joint]:.3f} rad): correct the range in the arm file, or, if this joint has no stop, "
+                "sweep with `--hold servo`"
             )
 
     def _check_stop(self, joint: int, side: int) -> None:
@@ -350,7 +351,7 @@ class Mover:
             raise Refused(
                 f"{self.link.names[joint]} was blocked at {found:.3f} rad, but its stop should be at "
                 f"{limit:.3f} rad: is something in the way, or is the range in the arm file wrong? If this "
-                "joint has no stop, sweep with `--hold servo --no-check-stops`"
+                "joint has no stop, sweep with `--hold servo`"
             )
         self.contacts[joint, side] = found
 

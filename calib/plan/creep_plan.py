@@ -195,7 +195,7 @@ def refuse_unbearable_creeps(arm_file: ArmFile, mass: float) -> None:
 
 def check_creep_limits(creeping: CreepingArm, arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
-    require_bounds(arm_file, plan, creeping.ends, creeping.ends, creeping.ends)
+    require_bounds(arm_file, plan, creeping.ends, creeping.ends)
     refuse_unfit(arm_file, _unfit(creeping, plan))
 
 

@@ -14,8 +14,6 @@ from calib.plan.planned_arm import FASTEST, SLOWEST, PlannedArm
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
-SERVO_GAP = 0.05
-"""Distance from the stop at which a servo-held joint rests [rad]; a choice."""
 ROUNDING = 1e-6
 """Share of a value, or [rad], by which arithmetic in another order may differ: far above that of 64-bit numbers."""
 
@@ -27,10 +25,7 @@ Ends = tuple[Array, Array]
 def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of static readings leaves the arm file's limits."""
     planned = PlannedArm(arm_file)
-    limits = planned.limits
-    stops = (limits.lower, limits.upper)
-    held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
-    require_bounds(arm_file, plan, planned.ends, held, stops)
+    require_bounds(arm_file, plan, planned.ends, (planned.limits.lower, planned.limits.upper))
     refuse_unfit(arm_file, _of_drives(plan, planned))
 
 
@@ -39,11 +34,11 @@ def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
     refuse_unfit(arm_file, (f"sweep {sweep.name}: `bias` is missing" for sweep in plan.sweeps if sweep.bias is None))
 
 
-def require_bounds(arm_file: ArmFile, plan: SweepPlan, moving: Ends, held: Ends, pressed: Ends) -> None:
-    """Raise Refused where a plan has another number of joints, or a pose beyond the bounds: of joints on their way,
-    scout poses included, of those that rest in their servo, and of those on a stop."""
+def require_bounds(arm_file: ArmFile, plan: SweepPlan, servoed: Ends, pressed: Ends) -> None:
+    """Raise Refused where a plan has another number of joints, or a pose beyond the bounds: of joints that their servo
+    moves or holds, scout poses included, and of those on a stop."""
     refuse_unfit(arm_file, _of_shape(plan, len(arm_file.joint_names)))
-    refuse_unfit(arm_file, _of_poses(plan, moving, held, pressed, arm_file.joint_names))
+    refuse_unfit(arm_file, _of_poses(plan, servoed, pressed, arm_file.joint_names))
 
 
 def refuse_unfit(arm_file: ArmFile, found: Iterator[str]) -> None:
@@ -80,14 +75,14 @@ def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
             yield f"sweep {sweep.name}: one joint is held neither on a stop nor by its position loop"
 
 
-def _of_poses(plan: SweepPlan, moving: Ends, held: Ends, pressed: Ends, names: Sequence[str]) -> Iterator[str]:
+def _of_poses(plan: SweepPlan, servoed: Ends, pressed: Ends, names: Sequence[str]) -> Iterator[str]:
     for number, pose in enumerate(plan.scout, start=1):
-        yield from _beyond(f"scout pose {number}", np.array(pose), *moving, names)
+        yield from _beyond(f"scout pose {number}", np.array(pose), *servoed, names)
     for sweep in plan.sweeps:
         servo = np.array(sweep.servo)
+        servo[sweep.joint] = True
         stop = np.where(np.array(sweep.stops) > 0, pressed[1], pressed[0])
-        lower, upper = (np.where(servo, each, stop) for each in held)
-        lower[sweep.joint], upper[sweep.joint] = (each[sweep.joint] for each in moving)
+        lower, upper = (np.where(servo, each, stop) for each in servoed)
         for what, step in (("first step", sweep.steps[0]), ("last step", sweep.steps[-1])):
             there = np.array(sweep.rest)
             there[sweep.joint] = step

@@ -13,7 +13,6 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.plan.collisions import Collided, straight_way, sweep_ends
-from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.planned_arm import SLOWEST, PlannedArm, nearest_first
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments, stop_combinations, with_lever
@@ -251,9 +250,8 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"even with long averages, gains will be known only to ± {200 * gain_std / finer:.2g} %, and "
-            f"the goal is ± {200 * goal:.2g} %: use a heavier reference mass or more sweep.poses, or measure where "
-            "the mass hangs (sweep.reference_point)"
+            f"the worst gain will be known to about ± {200 * gain_std / finer:.2g} %, and the goal (sweep.gain_std) is "
+            f"± {200 * goal:.2g} %: go on, or use a heavier mass, more sweep.poses, or a measured sweep.reference_point"
         )
     return SweepPlan(
         sweeps=sweeps,
@@ -365,7 +363,9 @@ def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sw
     joint, stops = options.joint, options.stops[pick]
     steps = np.linspace(*planned.sweep_range(joint), section.steps)
     servo, bias, acceleration = _hold(planned, options.kept(np.arange(options.count) == pick))
-    rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
+    low, high = planned.ends
+    pressed = np.where(stops > 0, limits.upper, limits.lower)
+    rest = np.where(servo, np.where(stops > 0, high, low), pressed)
     rest[joint] = steps[0]
     return Sweep(
         name=name,

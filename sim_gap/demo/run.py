@@ -22,7 +22,6 @@ from armlink.content.atomic_file import writing
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
-from armlink.loop.open import first_check
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
@@ -92,7 +91,8 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
     Demo(bench, seed, data, account).run()
     account.write(out, f"simulated arm {arm.name} with the hidden true values of seed {seed}")
-    suggest(command_line(*first_check(arm, arm_name)) if Path(arm_name).suffix else "armlink new MODEL.urdf")
+    real = f"{command_line('new', arm_name)} --force --bus socketcan:can0 --by-hand"
+    suggest(real if Path(arm_name).suffix else "armlink new MODEL.urdf")
 
 
 def quick(arm: ArmFile) -> ArmFile:
@@ -168,7 +168,7 @@ class Demo:
         with link:
             link.start()
             link.enable()
-            account.say(f"{link.n} drives were found on the bus, set up and enabled; {link.rate:g} cycles a second")
+            account.say(f"{link.n} simulated drives were found, set up and enabled; {link.rate:g} cycles a second")
             passes = self._passes()
             truth = bench.simulated.true_sensors  # as they are now: zeros move as the arm warms up
             account.say("fitting sensors and mass moments, all joints together", "bold")

@@ -41,6 +41,8 @@ SHORT = {"motion": "steps", "steps": 5, "poses": 1, "loaded_poses": 1, "hold": "
 ASKED = re.compile(
     r"(\S+): (?:now )?turn (?:this joint by hand|it) to its (?:lower|upper)\s+stop\s+\(([-+]\d+\.\d+)\s+rad\)"
 )
+LOWEST = 25.0
+"""Rate that is tried at least [Hz]: the kernel of `scripts/with-vcan` has one emulated processor for arm and host."""
 STARTED, ENDED = 20.0, 900.0
 """Seconds within which the simulated arm stands on the bus and a command ends."""
 
@@ -49,16 +51,31 @@ def identity(drive: dict) -> str:
     return next(key for key in ("node", "id", "joint") if key in drive)
 
 
-def shuffled(arm: str, seed: int) -> dict:
-    """The content of a bundled arm's file with the drives' ids drawn anew."""
-    content = yaml.safe_load(bundled_arms()[arm].read_text())
+def kept_rate(arm: str) -> float:
+    """Rate of a bundled arm, or the lower one that this machine keeps [Hz]."""
+    asked = [ARMLINK, "check", arm, "--host", "--seconds", "2", "--json", "-"]
+    answer = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    rate = yaml.safe_load(bundled_arms()[arm].read_text())["link"]["rate"]
+    return min(rate, max(LOWEST, round(json.loads(answer.stdout)["holds_hz"])))
+
+
+def described(arm: str) -> dict:
+    """The content of a bundled arm's file at a rate that this machine keeps."""
+    content = yaml.safe_load(bundled_arms()[arm].read_text()) | {"sweep": SHORT}
+    content["link"]["rate"] = kept_rate(arm)
+    return content
+
+
+def shuffled(content: dict, seed: int) -> dict:
+    """An arm file's content with the drives' ids drawn anew."""
+    content = deepcopy(content)
     drives = [joint["drive"] for joint in content["link"]["joints"]]
     key = identity(drives[0])
     if key != "joint":  # Piper's joints have no ids
         others = np.random.default_rng(seed).permutation([drive[key] for drive in drives])
         for drive, other in zip(drives, others.tolist(), strict=True):
             drive[key] = other
-    return content | {"sweep": SHORT}
+    return content
 
 
 @contextmanager
@@ -118,13 +135,14 @@ def turned_by_hand(folder: Path, control: Path, *words: str) -> tuple[int, str]:
 
 def tried(arm: str, bus: str, seed: int) -> list[str]:
     """What did not hold for an arm."""
-    wrong, content = list[str](), shuffled(arm, seed)
+    wrong, own = list[str](), described(arm)
+    content = shuffled(own, seed)
     joints = content["link"]["joints"]
     drives, kind = {joint["name"]: joint["drive"] for joint in joints}, joints[0]["drive"].get("family", "canopen")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         bundled = folder / "arm.yaml"
-        bundled.write_text(yaml.safe_dump(yaml.safe_load(bundled_arms()[arm].read_text()) | {"sweep": SHORT}))
+        bundled.write_text(yaml.safe_dump(own))
         first = deepcopy(content)
         delivered = first["link"]["joints"][AS_DELIVERED]["drive"]
         if "reply" in delivered:

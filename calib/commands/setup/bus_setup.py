@@ -87,6 +87,8 @@ def _tell(
     show_findings(console, findings)
     step = command_line(*first_check(arm, str(out)))
     console.print(f"{out} is written with {len(matches)} drives: {addresses([each.drive for each in matches])}{more}")
+    if not all(each.by_hand for each in matches):
+        console.print("the drives are assumed to belong to the joints in the order of their ids; --by-hand checks it")
     suggest(step)
     joints = [
         {"name": each.joint, "node": each.drive.node, "by_hand": each.by_hand}

@@ -29,7 +29,7 @@ def doctor(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.content.printable_text import printable_text
-    from armlink.loop.open import first_check
+    from armlink.loop.open import first_check, is_in_process
     from calib.commissioning.doctor import examine
 
     console = results(json_file)
@@ -43,6 +43,8 @@ def doctor(
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to correct first")
     else:
         console.print("no errors")
-        suggest(command_line(*first_check(load_arm(arm), arm, bus), bus=bus))
+        own = load_arm(arm)
+        rehearsed = is_in_process(own, bus)
+        suggest(command_line("demo", arm=arm) if rehearsed else command_line(*first_check(own, arm, bus), bus=bus))
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [vars(each) for each in findings]})
     return 1 if errors else 0

@@ -70,8 +70,7 @@ def new(
         bool | None,
         typer.Option(
             help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without "
-            "power; with --no-by-hand, take the drives in the order of their node ids. By default the "
-            "command asks.",
+            "power; with --no-by-hand, take the drives in the order of their node ids. By default the command asks.",
             show_default=False,
             rich_help_panel="Drives on a bus",
         ),

@@ -99,8 +99,8 @@ class Terminal:
 
         question = (
             f"{joint.name} has {joint.limits_in_words} in the model. Give its lower and upper stop [rad], such as "
-            f"-2.1 2.1, or Enter if it has none: then it turns by {ASSUMED_STOP} rad to either side, and joints are "
-            "held by their servos"
+            f"-2.1 2.1, or Enter if it has none: then it turns by at most {ASSUMED_STOP} rad to either side, and "
+            "joints are held by their position loops"
         )
         given: tuple[float, float] | None = ask(question, default="", show_default=False, value_proc=_two_stops)
         return given

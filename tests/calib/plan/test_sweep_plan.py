@@ -105,6 +105,17 @@ def test_servo_hold_presses_nothing() -> None:
         assert sum(sweep.servo) == 2
 
 
+@pytest.mark.parametrize("wrong", [0.98, 1.02])
+def test_a_joint_held_by_its_servo_touches_no_stop_whatever_its_position_gain(wrong: float) -> None:
+    """At 5.76 rad, where a Jaco's wrist has its stop, an encoder that reads 1 % too little is 0.06 rad off."""
+    arm = with_section(random_arm(6, 3), hold="servo")
+    joints = [joint.model_copy(update={"lower": 0.38, "upper": 5.76}) for joint in arm.kinematics.joints]
+    arm = arm.model_copy(update={"kinematics": arm.kinematics.model_copy(update={"joints": joints})})
+    for sweep in plan_sweep(arm).sweeps:
+        angle = np.array(sweep.rest) / wrong
+        assert np.all((angle > 0.39) & (angle < 5.75))
+
+
 def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
     """Checked with MuJoCo's inertia, which the plan has not seen; this upright arm's first drive has little torque."""
     arm, truth = drawn_arm(9, upright=True, hold="servo")
