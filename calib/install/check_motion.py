@@ -92,8 +92,8 @@ class CheckMotion:
             away = float(np.mean(after[:, j] - expected))
             if abs(away) > self._floor[j]:
                 return (
-                    f"{name}: its readings before the write, converted with the new calibration, differ by {away:+.3f} "
-                    "N·m from its readings after the write"
+                    f"{name}: its readings after the write are {away:+.3f} N·m from the expected ones, which are the "
+                    "readings before the write, converted with the new calibration"
                 )
         return None
 
