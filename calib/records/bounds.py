@@ -84,19 +84,18 @@ def require_sound(record: R, arm: ArmFile, now: datetime | None = None) -> R:
     for each in values:
         if not each.lower <= each.value <= each.upper:
             unit = each.unit and f" {each.unit}"
-            raise _unsound(record, f"{each.what} is {each.value:.6g}{unit}, not {each.lower:.6g} to {each.upper:.6g}")
+            usual = f"{each.lower:.6g} to {each.upper:.6g}"
+            raise _unsound(record, f"{each.what} is {each.value:.6g}{unit}; working arms have {usual}")
     return record
 
 
 def _unsound(record: R, why: str) -> Refused:
-    return Refused(
-        f"record {record.id}: {why}, which no working arm has: calibrate again, or go back to another record"
-    )
+    return Refused(f"record {record.id}: {why}: calibrate again, or go back to another record")
 
 
 def _require_date(record: R, now: datetime | None) -> None:
     if not EARLIEST <= record.created <= LATEST:
-        raise _unsound(record, f"created is {record.created:%Y-%m-%d}, not {EARLIEST:%Y} to {LATEST:%Y}")
+        raise _unsound(record, f"created is {record.created:%Y-%m-%d}, expected {EARLIEST:%Y} to {LATEST:%Y}")
     if now is not None and record.created > now + CLOCK_TOLERANCE:
         raise Refused(
             f"record {record.id} was created on {record.created:%Y-%m-%d %H:%M %Z}, but the clock of this machine says "

@@ -29,7 +29,7 @@ SUMMARIES: dict[Callable[..., object], str] = {
     collect: "Move the arm along a plan and record it.",
     diagnose_fleet: "Diagnose the recordings of many arms.",
     trend: "Find what changes over the recordings of one arm.",
-    bench: "Test the diagnosis on sealed cases.",
+    bench: "Test the diagnosis on simulated arms with hidden faults.",
 }
 for command, summary in SUMMARIES.items():
     app.command(cls=GroupedCommand, short_help=summary)(command)

@@ -376,7 +376,7 @@ def test_a_record_of_no_working_arm_that_is_current_is_told_and_not_observed_aga
     record = current.model_copy(update=wrong)
     activate_by_hand(daemon.store, record)
     daemon.run(7)
-    assert f"record {record.id}: created is 2200-01-01, not 1984 to 2106" in daemon.view.status().detail
+    assert f"record {record.id}: created is 2200-01-01, expected 1984 to 2106" in daemon.view.status().detail
     assert daemon.view.status().records.calibration != record.id
     assert not any(call.startswith("write") for call in daemon.sdo)
 
