@@ -138,7 +138,7 @@ def _show(fit: "GravityFit", console: "PlainConsole") -> None:
     beta, half = np.where(fit.identifiable, fit.beta, np.nan), 1.96 * fit.std
     columns = {"x": (beta[0::2], half[0::2]), "y": (beta[1::2], half[1::2])}
     if fit.recursive is not None:
-        recursive = fit.recursive.beta
+        recursive = np.where(fit.identifiable, fit.recursive.beta, np.nan)
         columns["x, recursive"] = recursive[0::2], 0 * half[0::2]
         columns["y, recursive"] = recursive[1::2], 0 * half[1::2]
     columns["residual [N·m]"] = fit.residual_rms, 0 * fit.residual_rms

@@ -290,7 +290,8 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
         return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads the joint in them"
     for sentence in fit.null_space:
         if name in sentence:
-            if sentence.startswith(f"{name} changes no reading"):
+            own = name.partition("[")[2]
+            if sentence.startswith((f"{name} changes no reading", f"gain[{own}, position_gain[{own} can change")):
                 return "gravity does not act on this joint in these poses, as with a vertical axis"
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"

@@ -250,8 +250,9 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"the worst gain will be known to about ± {200 * gain_std / finer:.2g} %, and the goal (sweep.gain_std) is "
-            f"± {200 * goal:.2g} %: go on, or use a heavier mass, more sweep.poses, or a measured sweep.reference_point"
+            f"if the mass hangs {100 * np.hypot(SIDE, SIDE):.0f} cm off the last joint's axis, the worst gain that can "
+            f"be found will be known to about ± {200 * gain_std / finer:.2g} %, and the goal (sweep.gain_std) is ± "
+            f"{200 * goal:.2g} %: go on, or use a heavier mass, more sweep.poses, or a measured sweep.reference_point"
         )
     return SweepPlan(
         sweeps=sweeps,

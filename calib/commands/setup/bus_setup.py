@@ -66,7 +66,11 @@ def rewire(
         text = f"{yaml_comment(title)}\n{text}"
     arm = parse_arm(parse_yaml(text, out), out)
     write_whole(out, text)
-    return _tell(out, arm, matches, "", findings + doubts, json)
+    how = "in the order of their ids, as assumed"
+    if by_ids:
+        how = "each at the joint that has its id in the file"
+    how = "" if all(each.by_hand for each in matches) else f", {how}: --by-hand checks it"
+    return _tell(out, arm, matches, how, findings + doubts, json)
 
 
 def _tell(
@@ -87,8 +91,6 @@ def _tell(
     show_findings(console, findings)
     step = command_line(*first_check(arm, str(out)))
     console.print(f"{out} is written with {len(matches)} drives: {addresses([each.drive for each in matches])}{more}")
-    if not all(each.by_hand for each in matches):
-        console.print("the drives are assumed to belong to the joints in the order of their ids; --by-hand checks it")
     suggest(step)
     joints = [
         {"name": each.joint, "node": each.drive.node, "by_hand": each.by_hand}

@@ -61,7 +61,7 @@ def test_an_implausible_record_is_not_written_and_that_is_an_event(
 
 
 @pytest.mark.parametrize(
-    ("values", "said"), [({"gain": 2.5}, "gain is 2.5, not"), ({"offset": 900.0}, "offset is 900")]
+    ("values", "said"), [({"gain": 2.5}, "gain is 2.5; working arms"), ({"offset": 900.0}, "offset is 900")]
 )
 def test_a_record_of_no_working_sensor_does_not_become_current(
     tmp_path: Path, values: dict[str, float], said: str

@@ -96,7 +96,7 @@ def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> N
     truth, data = passes(arm, 2)
     bare, plan = fit_sensors(arm, data), data[0].plan
     assert plan is not None
-    assert "the worst gain will be known to" in plan.notes[-1]
+    assert "be found will be known to" in plan.notes[-1]
     assert set(bare.imprecise) == {"j1", "j2", "j3"}
     assert "measure where the reference mass hangs" in bare.imprecise["j1"]
     assert np.abs(scores(bare, truth)[0]).max() < 2
