@@ -59,6 +59,7 @@ class PoseTours:
         self._choose(self._here, LONGEST_WINDOW, f"the sweep ({why})")
 
     def up(self) -> None:
+        self.stopped()
         self._here = None
 
     def heard(self, batch: Batch) -> None:
@@ -86,7 +87,9 @@ class PoseTours:
             self._events.say("refused", None, f"{what} was not begun: {outcome}", {})
         elif isinstance(outcome, Exception):
             raise outcome
-        elif self._here is not None and not np.array_equal(self._here, here):  # it had not come to rest
+        elif self._here is not None and (
+            self._state() is State.RECALIBRATING or not np.array_equal(self._here, here)  # not at rest yet
+        ):
             self._choose(self._here, poses, what)
         else:
             tour, work = outcome
