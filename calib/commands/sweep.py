@@ -87,8 +87,10 @@ def sweep(
         require_extra("--picture", "reports")
     arm_file = with_hold(load_arm(arm), hold)
     refuse_impossible_sweep(arm_file, reference_mass)
+    if check_stops is None:
+        check_stops = sweep_section(arm_file).hold == "stops"
     if plan:
-        write_json(json_file, _plan(arm_file, seed, reference_mass, picture, results(json_file)))
+        write_json(json_file, _plan(arm_file, seed, reference_mass, check_stops, picture, results(json_file)))
         simulated = bus is None and arm_file.require_link().bus.interface == SIMULATED
         folder = Path(("rehearsal-" if simulated else "") + ("loaded" if reference_mass else "unloaded"))
         suggest(
@@ -124,8 +126,7 @@ def sweep(
             link.enable()
             on_stall = screen.on_stall(keep_going)
             found = heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
-            wanted = sweep_section(arm_file).hold == "stops" if check_stops is None else check_stops
-            if wanted and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
+            if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
                 pushed = partial(screen.count, what="stops, each touched by its joint")
                 found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
             data = run_sweep(
@@ -146,10 +147,15 @@ def sweep(
 
 
 def _plan(
-    arm_file: "ArmFile", seed: int, reference_mass: float, picture: Path | None, console: "PlainConsole"
+    arm_file: "ArmFile",
+    seed: int,
+    reference_mass: float,
+    check_stops: bool,
+    picture: Path | None,
+    console: "PlainConsole",
 ) -> dict[str, Any]:
     """Print and check the plan, and draw it if asked to; the answer for machines."""
-    from calib.arm.sweep_section import sweep_motion, sweep_section
+    from calib.arm.sweep_section import sweep_motion
     from calib.commands.screen import print_plan
     from calib.plan.collisions import check_plan
     from calib.plan.creep_plan import creep_seconds, plan_creep
@@ -168,7 +174,7 @@ def _plan(
         took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
         told = f"about {_minutes(took)} for a pass"
-        if sweep_section(arm_file).hold == "stops":
+        if check_stops:
             told += (
                 f", {_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
             )

@@ -188,9 +188,9 @@ def _narrow_until_clear(made: NewArm) -> None:
             joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
         made.draft.servo = f"the ranges under kinematics.stops are narrower than the model's limits ({reason})"
         if sweep_problem(made.parsed()) is None:
+            why = "; narrowed, so that no sweep collides"
             for joint in made.draft.joints:
-                narrowed = [f"{note}; narrowed, so that no sweep collides" for note in joint.notes if "stops" in note]
-                joint.notes = [*narrowed, *(note for note in joint.notes if "stops" not in note)]
+                joint.notes = [note + why * note.startswith("stops assumed") for note in joint.notes]
             return
     raise problem
 

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.errors import BadInput
+from armlink.errors import BadInput, Refused
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.plan.collisions import Geometry, straight_way
@@ -95,7 +95,7 @@ class PlannedArm:
     ) -> Array:
         """Random poses (P, n) [rad] about which, by so much [rad], nothing touches, each reached straight from the one
         before, the first from `begin` (n,), no joint moving more than `reach` [rad]; there are `count` unless the arm
-        reaches fewer."""
+        reaches fewer. Raises Refused where it reaches none."""
         lower, upper = self.ends
         here, found = begin, list[Array]()
         for _ in range(TRIES * count):
@@ -106,6 +106,13 @@ class PlannedArm:
             if self.free(around).all() and self.is_clear(here, pose):
                 found.append(pose)
                 here = pose
+        if count and not found:
+            touching = self.geometry.contacts(begin) if self.geometry is not None else []
+            bodies = " and ".join(touching[0].bodies) if touching else "none"
+            raise Refused(
+                f"{self.arm_file.name}: the arm reaches no pose from its present pose without a collision of the "
+                f"model's shapes (touching now: {bodies}): move the arm clear, or correct the shapes"
+            )
         return np.array(found).reshape(-1, self.arm.n)
 
     # ---- torques, by the rough gravity model

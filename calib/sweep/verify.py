@@ -124,11 +124,6 @@ def run_verify(
     elif at is None:
         at = partial(verify_poses, PlannedArm(arm_file), poses, seed)
     held_out = at(mover.position)
-    if not len(held_out):
-        raise Refused(
-            f"{arm_file.name}: according to the model, bodies touch on the way from the present pose to every other "
-            "pose: move the arm to a pose without contact, or correct the model's collision shapes"
-        )
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
@@ -207,7 +202,7 @@ def verify_poses(planned: PlannedArm, count: int, seed: int, begin: Array, about
     """Random poses (P, n) [rad] about which, by so much [rad], nothing touches, each reached straight from the one
     before, the first from `begin` (n,); there are `count` unless the arm reaches fewer.
 
-    Where the arm file has no geometry they are in an order with little travel.
+    Where the arm file has no geometry they are in an order with little travel. Raises Refused where it reaches none.
     """
     poses = planned.reachable_poses(count, np.random.default_rng([seed, 6]), begin, about=about)
     return poses[nearest_first(poses, begin)] if planned.geometry is None else poses

@@ -66,11 +66,9 @@ def rewire(
         text = f"{yaml_comment(title)}\n{text}"
     arm = parse_arm(parse_yaml(text, out), out)
     write_whole(out, text)
-    how = "in the order of their ids, as assumed"
-    if by_ids:
-        how = "each at the joint that has its id in the file"
-    how = "" if all(each.by_hand for each in matches) else f", {how}: --by-hand checks it"
-    return _tell(out, arm, matches, how, findings + doubts, json)
+    where = "each at the joint that has its id in the file" if by_ids else "in the order of their ids, as assumed"
+    more = "" if all(each.by_hand for each in matches) else f", {where}: --by-hand checks it"
+    return _tell(out, arm, matches, more, findings + doubts, json)
 
 
 def _tell(

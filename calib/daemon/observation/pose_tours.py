@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.errors import ArmlinkError, Refused
+from armlink.errors import ArmlinkError
 from armlink.loop.messages import Batch, Progress
 from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration
@@ -48,15 +48,16 @@ class PoseTours:
 
     def request(self, why: str) -> None:
         """Begin a tour, so that the observer gets enough poses."""
-        state = self._state()
-        if self._configuration.listen_only or state is not State.OBSERVING or self._here is None:
+        here = self._here
+        state = State.STARTING if here is None else self._state()
+        if here is None or self._configuration.listen_only or state is not State.OBSERVING:
             reason = "the daemon only listens" if self._configuration.listen_only else f"the daemon is {state}"
             self._events.say("refused", None, f"the sweep ({why}) was not begun: {reason}", {})
             return
         self.progress, self._last = Progress(0, LONGEST_WINDOW), self._environment.monotonic()
-        nowhere = np.empty((0, len(self._here)))
-        self._walk(self._here, nowhere, nowhere)  # the arm rests until poses are chosen
-        self._choose(self._here, LONGEST_WINDOW, f"the sweep ({why})")
+        nowhere = np.empty((0, len(here)))
+        self._walk(here, nowhere, nowhere)  # the arm rests until poses are chosen
+        self._choose(here, LONGEST_WINDOW, f"the sweep ({why})")
 
     def up(self) -> None:
         self.stopped()
@@ -139,16 +140,8 @@ class PoseTours:
 def chosen_poses(arm_file: ArmFile, here: Array, poses: int, work: int, seed: int) -> tuple[Array, Array]:
     """Poses of a tour (P, n) from `here` (n,), and of work from its end (W, n) [rad]; nothing touches on their ways.
 
-    There are `poses` and `work` of them unless the arm reaches fewer. Raises Refused where it reaches none, BadInput.
+    There are `poses` and `work` of them unless the arm reaches fewer. Raises as `reachable_poses`, and BadInput.
     """
     planned, random = PlannedArm(arm_file), np.random.default_rng([seed, 8])
     tour = planned.reachable_poses(poses, random, here)
-    at_work = planned.reachable_poses(work, random, tour[-1] if len(tour) else here, reach=WorkMotion.reach)
-    if len(tour) < min(poses, 1) or len(at_work) < min(work, 1):
-        touching = planned.geometry.contacts(here) if planned.geometry is not None else []
-        bodies = " and ".join(touching[0].bodies) if touching else "none at its pose"
-        raise Refused(
-            "the arm reaches no pose from its present pose without a collision of the model's shapes (touching now: "
-            f"{bodies}): move the arm clear, or correct the shapes"
-        )
-    return tour, at_work
+    return tour, planned.reachable_poses(work, random, [here, *tour][-1], reach=WorkMotion.reach)
