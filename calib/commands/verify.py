@@ -120,9 +120,6 @@ def _show(result: "Verification", console: "PlainConsole") -> None:
     beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
     agree = "passed: at every joint the RMS difference between model and sensor is within the limit"
     console.print(f"failed: the RMS difference is beyond the limit at {', '.join(beyond)}" if beyond else agree)
-    largest = abs(result.model).max(axis=0)
-    untold = [name for name, within in zip(result.names, largest < result.tolerance, strict=True) if within]
-    if untold:
-        console.print(
-            f"the torque gain of {', '.join(untold)} was not verified: gravity torque is below the limit there"
-        )
+    light = abs(result.model).max(axis=0) < result.tolerance
+    if untold := ", ".join(name for name, is_light in zip(result.names, light, strict=True) if is_light):
+        console.print(f"the torque gain of {untold} was not verified: gravity torque is below the limit there")
