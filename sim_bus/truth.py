@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.model_file import read_model
 from sim_bus.effects.quasi_direct import QuasiDirect
 from sim_bus.sim_section import sim_section
 
@@ -73,7 +75,7 @@ class Truth:
             offset=random.uniform(-OFFSET_SHARE, OFFSET_SHARE, n) * rated,
             position_gain=random.uniform(*POSITION_GAIN_RANGE, n),
             position_offset=stated.position_offset,
-            attachment=stated.attachment + np.array([*lateral, 0.0]),
+            attachment=stated.attachment + across_last_axis(arm) @ lateral,
         )
 
     @classmethod
@@ -82,7 +84,7 @@ class Truth:
         rated = arm.require_link().rated_torques
         n = len(rated)
         lateral = np.random.default_rng([seed, 55]).uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
-        place = flange(arm) + np.array([*lateral, 0.0])
+        place = flange(arm) + across_last_axis(arm) @ lateral
         return cls(drives.gains(n, seed), drives.offsets(rated, seed), np.ones(n), drives.zeros(n, seed), place)
 
 
@@ -92,3 +94,13 @@ def flange(arm: ArmFile) -> Array:
         return np.zeros(3)
     last = arm.kinematics.joints[-1]
     return np.array([last.a, 0.0, last.d])
+
+
+def across_last_axis(arm: ArmFile) -> Array:
+    """Two directions (3, 2) in the last link's bar frame, at right angles to the last joint's axis and each other."""
+    turn, axes = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(9)
+    if arm.model_path is not None:
+        axis = read_model(arm.model_path, arm.kinematics.locked).spec.joint(arm.joint_names[-1]).axis
+        mujoco.mju_quatZ2Vec(turn, axis / np.linalg.norm(axis))
+    mujoco.mju_quat2Mat(axes, turn)
+    return axes.reshape(3, 3)[:, :2]

@@ -6,6 +6,8 @@ MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
 CROWD_PER_JOINT, CROWD = 5, 30
 """Normal limit of frames per cycle: 5 per joint, ours included, and 30 others (a scan by another tool is short)."""
+OWN_RATE = 250.0
+"""Drives that send by their own clock do so 5 times per joint at this rate at most [Hz], whatever the cycle."""
 CROWDED_CYCLES = 10
 """Consecutive cycles above that limit that mean a babbling node."""
 DOUBLE_CYCLES = 3
@@ -24,8 +26,9 @@ TORQUE_MEMORY = 10
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
-    def __init__(self, joints: int) -> None:
-        self._crowd = CROWD_PER_JOINT * joints + CROWD
+    def __init__(self, joints: int, own_clock: float = 0.0) -> None:
+        """`own_clock`: the period of a cycle [s] where drives send by their own clock."""
+        self._crowd = CROWD_PER_JOINT * joints * max(1.0, OWN_RATE * own_clock) + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._slow_readings = [0] * joints
@@ -97,8 +100,9 @@ class BusWatch:
         if kept + 1.0 > EXCESS:
             self.forged = joint
 
-    def cycle_ends(self, frames: int) -> None:
-        """Evaluate the completed cycle, with the number of frames sent and received in it."""
+    def cycle_ends(self, frames: int, periods: float) -> None:
+        """Evaluate the completed cycle, with the number of frames sent and received in it and the time that it took, in
+        periods."""
         if self._doubled or any(self._double_cycles):
             for joint, count in enumerate(self._double_cycles):
                 if joint in self._doubled:
@@ -107,7 +111,7 @@ class BusWatch:
                     self._double_cycles[joint], self.readings[joint] = 0, min(self.readings[joint], self.syncs)
             self._doubled.clear()
         self.crowding += (self.strangers - self.crowding) / CROWDED_CYCLES
-        self._crowded_cycles = self._crowded_cycles + 1 if frames > self._crowd else 0
+        self._crowded_cycles = self._crowded_cycles + 1 if frames > self._crowd * max(periods, 1.0) else 0
         if self._crowded_cycles or self.flooded or self.strangers:
             most = self._most_frequent()
             self._culprit = self._culprit if most == "" else most

@@ -49,7 +49,9 @@ class Loop:
         self.period = period
         self.stats = Stats()
         self.board = board = Board(self.n)
-        self.watch = BusWatch(self.n)
+        traits = traits_of(self.groups)
+        cadences = {each.cadence for each in traits}
+        self.watch = BusWatch(self.n, period if "cyclic" in cadences else 0.0)
         board.on_again, board.on_slow = self.watch.again, self.watch.slow
         board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
@@ -65,13 +67,11 @@ class Loop:
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
         self._rest = 0.0
         """Time from the commands until it looks for replies [s]."""
-        self.woke = -math.inf
+        self.woke = self._drained = -math.inf
         """When it last began to take in replies that nobody waited for, by the clock [s]."""
         self.just_woke = False
         """Whether that was after the last commands."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
-        traits = traits_of(self.groups)
-        cadences = {each.cadence for each in traits}
         self._pass_time: Callable[[float], None] | None = None
         if lock_step and "sync" not in cadences:
             self._pass_time = getattr(port, "pass_time", None)
@@ -168,11 +168,12 @@ class Loop:
         complete, board.awaited = self.just_woke and board.awaited <= 0, 0
         if not complete:
             self._take_what_is_there()
-        self._keep_late()
-        self.watch.cycle_ends(self.stats.frames - self._counted)
-        self._counted = self.stats.frames
+        now = self._clock.now()
+        self._keep_late(now)
+        self.watch.cycle_ends(self.stats.frames - self._counted, (now - self._drained) / self.period)
+        self._counted, self._drained = self.stats.frames, now
         if board.slow_came:
-            self._keep_slow(self._clock.now())
+            self._keep_slow(now)
 
     def _take_what_is_there(self) -> int:
         """Take in the frames that are there, counted all at once; how many they were."""
@@ -193,10 +194,9 @@ class Loop:
         self.count(came, size)
         return came
 
-    def _keep_late(self) -> None:
+    def _keep_late(self, now: float) -> None:
         """Replies that came after their cycle: as old as the last commands at least, and of no sample."""
         board, values = self.board, self.values
-        now = self._clock.now()
         for joint, raw in enumerate(board.position):
             if raw == raw and board.asked[joint]:  # not NaN
                 self.latest_position[joint] = values.position_of(joint, raw)

@@ -159,7 +159,7 @@ def _plan(
     from calib.commands.screen import print_plan
     from calib.plan.collisions import check_plan
     from calib.plan.creep_plan import creep_seconds, plan_creep
-    from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
+    from calib.plan.drawing import draw_plan, reading_seconds, stops_seconds
     from calib.plan.rough_gravity import guess_of_file
     from calib.plan.sweep_plan import plan_sweep
 
@@ -167,11 +167,11 @@ def _plan(
     drawn = "" if picture is None else f"; the poses are drawn in {picture}"
     if sweep_motion(arm_file) == "creep":
         planned = plan_creep(arm_file, seed=seed)
-        took = answer["seconds"] = creep_seconds(planned)
+        took = answer["seconds"] = float(creep_seconds(planned).sum())
         told = f"{len(planned.sweeps)} creep sweeps in both directions, about {_minutes(took)} for each pass{drawn}"
     else:
         planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
-        took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
+        took, checked = float(reading_seconds(arm_file, planned).sum()), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
         told = f"about {_minutes(took)} for a pass"
         if check_stops:

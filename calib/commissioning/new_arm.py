@@ -60,16 +60,12 @@ def clear_ranges(arm_file: ArmFile) -> Iterator[tuple[Array, Array]]:
 
 
 def sweep_problem(arm_file: ArmFile) -> Exception | None:
-    """The error that planning the sweeps ends with, None if it succeeds.
-
-    Without detours: the ranges are kept only where the straight plan is clear, since the daemon's tours and a person's
-    own work use them, too.
-    """
+    """The error that planning the sweeps ends with, None if it succeeds."""
     guess = guess_of_file(arm_file)
     try:
         for seed in (0, 1):  # plans that must be clear for a range to be kept
-            check_plan(arm_file, plan_sweep(arm_file, seed=seed, detours=False))
-            check_plan(arm_file, plan_sweep(arm_file, guess, seed=seed, detours=False))
+            check_plan(arm_file, plan_sweep(arm_file, seed=seed))
+            check_plan(arm_file, plan_sweep(arm_file, guess, seed=seed))
     except (ArmlinkError, GcompError) as error:
         return error
     return None

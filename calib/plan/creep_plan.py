@@ -219,14 +219,14 @@ def _unfit(creeping: CreepingArm, plan: SweepPlan) -> Iterator[str]:
             yield f"sweep {sweep.name}: with {mass:g} kg, a drive cannot hold its joint in this sweep within max_torque"
 
 
-def creep_seconds(plan: SweepPlan) -> float:
-    """Rough duration of a pass [s]."""
-    total = 0.0
+def creep_seconds(plan: SweepPlan) -> Array:
+    """Rough duration (sweeps,) of each sweep of a pass of creeps, with the way to it [s]."""
+    seconds = list[float]()
     for sweep in plan.sweeps:
         speed = creep_speed(sweep)
         way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
-        total += 2 * way / speed + TRAVEL_SECONDS
-    return total
+        seconds.append(2 * way / speed + TRAVEL_SECONDS)
+    return np.array(seconds)
 
 
 def creep_speed(sweep: Sweep) -> float:

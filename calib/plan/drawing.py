@@ -13,7 +13,7 @@ from calib.arm.kinematics import DriveLimits, frame_origins, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
 from calib.plan.collisions import sweep_ends
-from calib.plan.types import SCOUT_TITLE, SweepPlan
+from calib.plan.types import SCOUT_ACCELERATION, SCOUT_TITLE, SweepPlan
 from gcomp.arrays import Array
 
 PRESS, READ = 1.0, 0.5
@@ -24,27 +24,28 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e
 """One per joint."""
 
 
-def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
-    """Rough duration of one pass of a plan [s]."""
+def reading_seconds(arm_file: ArmFile, plan: SweepPlan) -> Array:
+    """Rough duration (readings,) of each reading of a pass of steps, with the way to it [s]."""
     section, limits = sweep_section(arm_file), DriveLimits.of(arm_file)
     period, speed = 0.02, section.travel_speed * limits.speed
 
     def travel(start: Array, goal: Array, acceleration: float) -> float:
         return period * len(trajectory(start, goal, speed, np.full(len(goal), acceleration), period))
 
-    total, here = 0.0, np.array(plan.scout[0])
+    seconds, here = list[float](), np.array(plan.scout[0])
     for scouted in plan.scout:
         goal = np.array(scouted)
-        total += travel(here, goal, 1.0) + READ
+        seconds.append(travel(here, goal, SCOUT_ACCELERATION) + READ)
         here = goal
     for sweep in plan.sweeps:
         begin, _ = sweep_ends(sweep)
-        total += travel(here, begin, plan.travel_acceleration) + PRESS
         one = np.zeros(len(here))
         one[sweep.joint] = abs(sweep.steps[-1] - sweep.steps[0]) / (len(sweep.steps) - 1)
-        total += 2 * len(sweep.steps) * (travel(np.zeros(len(here)), one, sweep.acceleration) + READ)
+        each = np.full(sweep.readings, travel(np.zeros(len(here)), one, sweep.acceleration) + READ)
+        each[0] += travel(here, begin, plan.travel_acceleration) + PRESS
+        seconds.extend(each)
         here = begin
-    return total
+    return np.array(seconds)
 
 
 def stops_seconds(arm_file: ArmFile) -> float:

@@ -32,7 +32,7 @@ Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
 
-def scout_poses(planned: PlannedArm, seed: int, detours: bool = True) -> Poses:
+def scout_poses(planned: PlannedArm, seed: int) -> Poses:
     """n + 3 poses that determine mass moments and sensor offsets well, in an order with little travel.
 
     Poses in which bodies touch are left out; raises BadInput if too few remain.
@@ -41,7 +41,7 @@ def scout_poses(planned: PlannedArm, seed: int, detours: bool = True) -> Poses:
     poses = planned.free_poses(2 * count, np.random.default_rng(seed))
     middle = np.mean(planned.ends, axis=0)
     columns = gravity_regressor(planned.arm, poses)
-    chosen = _informative_poses(planned, poses, columns, 10.0, count, middle, detours)
+    chosen = _informative_poses(planned, poses, columns, 10.0, count, middle)
     return tuple(tuple(pose.tolist()) for pose in chosen)
 
 
@@ -57,20 +57,19 @@ def weighing_poses(arm_file: ArmFile, count: int, seed: int, begin: Array) -> Ar
 
 
 def _informative_poses(
-    planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int, begin: Array, detours: bool = True
+    planned: PlannedArm, poses: Array, columns: Array, offset: float, count: int, begin: Array
 ) -> Array:
     """The poses (count, n) that tell most (D-optimal) of unknowns with these columns (P, n, p) of torque and of every
     joint's offset, in units of `offset` [N·m]; from `begin` (n,) on each is near to the one before.
 
-    With `detours`, poses on whose way something touches give their place to others, as long as there are any.
+    Poses on whose way something touches give their place to others, as long as there are any.
     """
     offsets = np.broadcast_to(offset * np.eye(poses.shape[1]), (*poses.shape, poses.shape[1]))
     rows, left = np.concatenate([columns, offsets], axis=2) / planned.limits.rated[:, None], np.arange(len(poses))
     while True:
         (chosen,) = select([rows[left][None]], UNKNOWN * np.eye(rows.shape[2])[None], [count], exchanges=0)
         order = left[chosen][nearest_first(poses[left[chosen]], begin)]
-        ways = pairwise(order) if detours else ()
-        blocked = [goal for here, goal in ways if not planned.is_clear(poses[here], poses[goal])]
+        blocked = [goal for here, goal in pairwise(order) if not planned.is_clear(poses[here], poses[goal])]
         left = np.setdiff1d(left, blocked)
         if not blocked or len(left) < count:
             return poses[order]
@@ -217,14 +216,13 @@ def plan_sweep(
     seed: int = 0,
     reference_mass: float = 0.0,
     resolution: Array | None = None,
-    detours: bool = True,
 ) -> SweepPlan:
     """The plan of one pass over all joints, tip to base.
 
     `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing; `resolution` (n,) [rad] that of the
     position readings, if known. Without `guess` nothing is known of the masses and no bias torque is set. With the
     scout's guess, combinations that cannot be held within max_torque are left out, the others get their bias torques,
-    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. With `detours`, poses and
+    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Poses and
     combinations on whose way something touches give their place to others, as long as there are any. Raises BadInput
     if a joint's range is too short to sweep or no combination can be held.
     """
@@ -236,11 +234,11 @@ def plan_sweep(
     given = reference_mass or section.reference_mass
     masses = [given] if given else reference_masses(planned, reached)
     poses = section.loaded_poses if reference_mass else section.poses
-    scout = scout_poses(planned, seed, detours)
+    scout = scout_poses(planned, seed)
     while True:
         design = StopDesign.of(planned.arm, options, moments, section.standard_error * planned.limits.rated, masses[-1])
         sweeps, mass, gain_std = _as_exact_as_asked(planned, design, poses, scout, masses, resolution)
-        blocked = _first_blocked(planned, np.array(scout[-1]), sweeps) if detours else None
+        blocked = _first_blocked(planned, np.array(scout[-1]), sweeps)
         if blocked is None:
             break
         left = [_without(each, blocked) for each in options]

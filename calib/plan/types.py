@@ -9,6 +9,8 @@ APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
 SCOUT = "scout"
 """Name in data sets of the readings at a few poses, under position control, before the first sweep."""
+SCOUT_ACCELERATION = 1.0
+"""Of its ways: nothing is known of the arm's weight yet [rad/s²]."""
 SCOUT_TITLE = "rough gravity model"
 """Their name for people: their purpose."""
 

@@ -8,7 +8,15 @@ from calib.dataset import StallLine
 from calib.motion.mover import Stalled
 from calib.motion.static_reading import StaticReading, bin_readings
 from calib.plan.collisions import check_creeps
-from calib.plan.creep_plan import RAMP, CreepingArm, check_creep_limits, creep_ends, creep_speed, plan_creep
+from calib.plan.creep_plan import (
+    RAMP,
+    CreepingArm,
+    check_creep_limits,
+    creep_ends,
+    creep_seconds,
+    creep_speed,
+    plan_creep,
+)
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array
@@ -33,7 +41,7 @@ class CreepPass(SweepPass):
             self.keep(plan)
         self._home, self._contacts = np.array(plan.scout[0]), 0
         self._made = {reading.sweep for reading in self.data.readings}
-        self._made_before = len(self._made)
+        self._made_before, self.expected = len(self._made), creep_seconds(plan)
         return plan
 
     def sweep(self, sweep: Sweep) -> None:
@@ -53,7 +61,7 @@ class CreepPass(SweepPass):
             self.writer.append(reading)
         self._made.add(sweep.name)
         up = [float(each.torque[sweep.joint]) for each in readings if each.direction.sum() > 0]
-        self.tell(len(self._made), len(self._plan.sweeps), self._made_before, sweep.name, up)
+        self.tell(len(self._made), self._made_before, sweep.name, up)
 
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
         mover, joint = self.mover, sweep.joint

@@ -14,15 +14,14 @@ from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Slipped, Stalled
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.collisions import check_plan
+from calib.plan.drawing import reading_seconds
 from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.sweep_plan import plan_sweep
-from calib.plan.types import APPROACH, SCOUT, Sweep, SweepPlan, reading_name
+from calib.plan.types import APPROACH, SCOUT, SCOUT_ACCELERATION, Sweep, SweepPlan, reading_name
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array
 
-SCOUT_ACCELERATION = 1.0
-"""Nothing is known of the arm's weight yet [rad/s²]."""
 SLOWER, SLOWEST = 0.4, 0.15
 """Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 
@@ -48,7 +47,7 @@ RETRIES = 3
 
 
 class StepPass(SweepPass):
-    total, acceleration = 0, 1.0
+    acceleration = 1.0
 
     def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
         """That of the data set, else a new one, with the bias torques that the scout finds."""
@@ -57,7 +56,7 @@ class StepPass(SweepPass):
         if plan is None:
             first = plan_sweep(self.arm, seed=seed, reference_mass=reference_mass)
             self._check(first)
-            self.total = first.readings
+            self.expected = reading_seconds(self.arm, first)
             self._scout(first)
             resolution = self.mover.known_resolution
             plan = _final_plan(self.arm, first, self.readings, reference_mass, seed, resolution)
@@ -67,7 +66,7 @@ class StepPass(SweepPass):
             check_bias(self.arm, plan)
             self._check(plan)
             self.mover.resolution = np.where(self.data.resolution > 0, self.data.resolution, np.inf)
-        self.total = plan.readings
+        self.expected = reading_seconds(self.arm, plan)
         self.acceleration, self.refuge = plan.travel_acceleration, np.array(plan.scout[0])
         self.mover.average_to(plan.standard_error)
         return plan
@@ -81,7 +80,7 @@ class StepPass(SweepPass):
         self.readings.append(reading)
         joint, name = reading.joint, reading_name(reading.sweep, reading.index)
         curve = [] if joint is None else [each.torque[joint] for each in self.readings if each.sweep == reading.sweep]
-        self.tell(len(self.readings), self.total, len(self.data.readings), name, curve)
+        self.tell(len(self.readings), len(self.data.readings), name, curve)
 
     def _scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""

@@ -8,6 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+import numpy as np
+
 from armlink.arm_file import ArmFile
 from armlink.errors import HostLate, Stall
 from armlink.loop.driver import ArmDriver
@@ -59,6 +61,8 @@ def repeat_work(
 Progress = Callable[[int, int, float, str], None]
 """Called with (readings or sweeps done, how many in all, seconds left, what is being done)."""
 
+TRUST = 30.0
+"""The plan counts for as much as so long a time of the pass itself [s]: its first ways are no sample of the rest."""
 BARS = "▁▂▃▄▅▆▇█"
 
 
@@ -78,6 +82,8 @@ class SweepPass(ABC):
         self.arm, self.mover, self.writer, self.data = arm, mover, writer, data
         self.progress: Progress = progress or (lambda *_: None)
         self._began, self._on_stall = time.monotonic(), on_stall
+        self.expected = np.zeros(0)
+        """By the plan [s], of each of what `tell` counts."""
 
     @abstractmethod
     def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
@@ -108,10 +114,11 @@ class SweepPass(ABC):
         restart(self.mover.link, self._on_stall, stall, note)
         repeat_work(self.mover.link, self._on_stall, self.mover.resume)
 
-    def tell(self, done: int, total: int, before: int, name: str, curve: Sequence[float]) -> None:
+    def tell(self, done: int, before: int, name: str, curve: Sequence[float]) -> None:
         """Report what is done, `before` of it by an earlier run; with a plot of the torques of the sweep under way."""
-        left = (time.monotonic() - self._began) / max(done - before, 1) * max(total - done, 0)
-        self.progress(done, total, left, f"{name} {sparkline(curve)}" if curve else name)
+        took, was_expected = time.monotonic() - self._began, float(self.expected[before:done].sum())
+        left = float(self.expected[done:].sum()) * (took + TRUST) / (was_expected + TRUST)
+        self.progress(done, len(self.expected), left, f"{name} {sparkline(curve)}" if curve else name)
 
 
 def sparkline(values: Sequence[float]) -> str:

@@ -9,6 +9,8 @@ from armlink.errors import BadInput
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
 from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
 
 FROM_CURRENT = (
     *("six-damiao", "six-cubemars", "six-moteus", "six-odrive", "six-robstride", "six-myactuator"),
@@ -32,6 +34,17 @@ def test_enable_hold_disable(name):
         link.disable()
         states = [group.drives.power(drive) for group in link.groups for drive in range(len(group.places))]
         assert set(states) == {Power.OFF}
+
+
+@pytest.mark.parametrize("name", ["six-odrive", "six-piper"])
+def test_what_drives_send_by_their_own_clock_is_no_flood_to_a_slow_host(name):
+    """A host that keeps 25 Hz gets eight Piper cycles in one of its own."""
+    arm = load_arm(name)
+    arm = arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 25.0})})
+    with Link(arm, LockStepBus(arm=SimulatedArm(arm, Truth.of(arm), 0))) as link:
+        link.start()
+        hold(link, Command.hold(link.enable().position), 50)
+        link.disable()
 
 
 @pytest.mark.sample(2)

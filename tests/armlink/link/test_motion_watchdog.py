@@ -164,7 +164,7 @@ def test_answers_to_other_requests_do_not_make_readings_that_catch_up_a_second_n
             bus.readings[0] += 1
             if number:
                 bus.again(0)
-        bus.cycle_ends(came)
+        bus.cycle_ends(came, 1.0)
 
     for came in [1, 2, 1, 1, 2, 1, 1, 2, 1]:  # three requests beside the cycle are answered
         cycle(came)
