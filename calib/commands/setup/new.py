@@ -58,7 +58,7 @@ def new(
             rich_help_panel="Model",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the arm; by default the name of the model.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the arm; by default the name of the arm file.")] = None,
     bus: Annotated[
         str | None,
         typer.Option(
