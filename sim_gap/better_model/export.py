@@ -8,6 +8,7 @@ from typing import Any
 
 from armlink.content.atomic_file import write_whole, writing
 from calib.arm.model_files import URDF, urdf_of, xml_comment
+from gcomp.arm.rigid_body import CREEP
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,
@@ -17,7 +18,7 @@ from sim_gap.better_model.corrected_model import (
 )
 from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
-from sim_gap.effects.torque import is_gradual
+from sim_gap.effects.torque import GRADUAL, is_gradual
 from sim_gap.model.load import SimModel, named_spec, urdf_behind
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
@@ -148,7 +149,9 @@ def module_text(sim: SimModel, effects: Sequence[JointEffect], model: str) -> st
     rows = "".join(f"    {each!r},\n" for each in effects)
     text = Path(forward_effects.__file__).read_text(encoding="utf-8")
     values = {
+        "from gcomp.arm.rigid_body import CREEP": f"CREEP = {CREEP}  # [rad/s], below which motion has no direction",
         "from gcomp.arrays import Array": "Array = np.ndarray",
+        "from sim_gap.effects.torque import GRADUAL": f"GRADUAL = {GRADUAL}  # half widths of plays over their mean",
         'MODEL = ""': f"MODEL = {model!r}",
         "JOINTS: tuple[str, ...] = ()": f"JOINTS = {sim.arm.names!r}",
         "EFFECTS: tuple[JointEffect, ...] = ()": f"EFFECTS = (\n{rows})",
