@@ -22,9 +22,9 @@ from sim_gap.position_gap.training.replay import (
     LONGEST_S,
     SHORT_S,
     Simulated,
+    model_without,
     replay_rms,
     simulated_model,
-    without_groups,
 )
 from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
@@ -233,7 +233,7 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
             continue
         others = [group for group in groups if group != stage.group]
         alone, without = (
-            gap(without_groups(found.sim, found.search, made, some), short) for some in (others, [stage.group])
+            gap(model_without(found.sim, found.search, made, some), short) for some in (others, [stage.group])
         )
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))

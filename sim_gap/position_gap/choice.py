@@ -269,8 +269,8 @@ OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) 
 """Effects that a controller has that had to be found: damping may be the servo's."""
 
 
-def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
-    return put_back(search, fit, search.places_of(group))
+def without_groups(search: LoopSearch, fit: LoopFit, *groups: Group) -> LoopFit:
+    return put_back(search, fit, [place for group in groups for place in search.places_of(group)])
 
 
 def parts_of(group: Group) -> list[Group]:
@@ -312,11 +312,11 @@ def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, mat
     """
     groups = groups_of(fit, search)
     final, floor = rms_on(heldout, fit.point), search.floor
-    alone = {group: rms_on(heldout, without_group(search, fit, group).point) for group in groups}
+    alone = {group: rms_on(heldout, without_groups(search, fit, group).point) for group in groups}
     order = sorted(groups, key=lambda group: -float(((alone[group] - final) / matters).max()))
     fits = [fit]
     for group in reversed(order):
-        fits.append(without_group(search, fits[-1], group))
+        fits.append(without_groups(search, fits[-1], group))
     known = [final, *(alone[group] for group in order[-1:])]
     courses = [*known, *(rms_on(heldout, each.point) for each in fits[len(known) :])][::-1]
     out = []

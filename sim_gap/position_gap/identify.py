@@ -21,7 +21,7 @@ from sim_gap.position_gap.choice import (
     scale_left,
     select,
     stages,
-    without_group,
+    without_groups,
     worth,
 )
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
@@ -211,9 +211,7 @@ def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> Loo
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
         return LoopFit(own | {"creep": search.data.plant.creep})
-    for group in groups_of(fit, search):
-        fit = without_group(search, fit, group)
-    return search.improve(fit, 4)
+    return search.improve(without_groups(search, fit, *groups_of(fit, search)), 4)
 
 
 def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:

@@ -19,7 +19,7 @@ from sim_gap.better_model.export import CorrectedText
 from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import put_delay
 from sim_gap.model.load import SimModel, named_spec
-from sim_gap.position_gap.choice import id_of, present, without_group
+from sim_gap.position_gap.choice import id_of, present, without_groups
 from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.plant import MovedModel
@@ -82,9 +82,7 @@ class Exported(CorrectedText):
 
 def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> LoopFit:
     """The fit with what a simulator holds alone, the rest fitted around it again."""
-    bare = fit
-    for group in _not_held(search, fit, held):
-        bare = without_group(search, bare, group)
+    bare = without_groups(search, fit, *_not_held(search, fit, held))
     share = compensation(search, fit)
     if share is None:
         share = np.full(search.data.joints, search.data.plant.compensated)
