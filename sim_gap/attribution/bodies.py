@@ -46,11 +46,8 @@ def body_of(estimate: EffectEstimate) -> Term | None:
 
 
 def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
-    """The held-out recordings, each numbered by whether it was made with the body that training recordings have.
-
-    By its groups if there are any; else by the sum of squares that remains with and without the body. If it is mounted
-    in another way, turned about the last joint's axis, by which angle. A recording that is a part of a training
-    recording stays as it is.
+    """The held-out recordings, each numbered by whether it was made with the body that training recordings have, and
+    with the angle by which that is turned about the last joint's axis.
     """
     body = body_of(estimate)
     train = estimate.store.data.signals
@@ -121,10 +118,7 @@ def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: in
 
 
 def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
-    """Angle about the last joint's axis from a body (mass, moment) to another one; zero if they are different bodies.
-
-    They are alike if their masses are, and the sizes of their moments across the axis.
-    """
+    """Angle about the last joint's axis from a body (mass, moment) to another; zero if they are different bodies."""
     axis = s.arm.axis[-1]
     across = [body[1:] - (body[1:] @ axis) * axis for body in (one, other)]
     sizes = [np.array([abs(b[0]), np.linalg.norm(r)]) for b, r in zip((one, other), across, strict=True)]

@@ -72,11 +72,8 @@ class _Scorer:
         return self._by_joint(self.squares(terms))
 
     def falls(self, terms: Sequence[Term], more: Sequence[Term], by_row: bool) -> Array:
-        """Decrease of each joint's RMS by `more` in addition to `terms`, (n,).
-
-        `by_row`, and at a joint whose command passes over noisy channels: the largest decrease of one row, noise
-        subtracted.
-        """
+        """Decrease of each joint's RMS by `more` in addition to `terms`, (n,); `by_row`, and at a joint whose command
+        passes over noisy channels, the largest of one row, noise subtracted."""
         layout = self.heldout.layout
         before, after = (self.squares([*chosen]) for chosen in (terms, [*terms, *more]))
         whole = self._by_joint(before) - self._by_joint(after)

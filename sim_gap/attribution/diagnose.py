@@ -1,10 +1,4 @@
-"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out.
-
-In order: the model (`sim_gap.model`), the check of joints, units and clocks (`sim_gap.checks`), prepared recordings and
-residuals (`sim_gap.residuals`), selection and fit of effects (`sim_gap.search`), causes, and the answer with verdict
-(this package). `armlink gap diagnose` (`sim_gap.commands.gap_diagnose`) reads the files, calls `diagnose` and shows its
-result.
-"""
+"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -70,12 +64,9 @@ def diagnose(
     tip: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Diagnosis:
-    """Explain the gap between a simulation model and recordings of the real arm.
+    """Explain the gap between a simulation model and recordings of the real arm, as `sim_gap.api.diagnose`.
 
     Args:
-        model: path of an MJCF, URDF or arm file, or a compiled `mujoco.MjModel`; the nominal arm.
-        train: recordings to fit.
-        heldout: recordings to judge on, not used in the fit; without any, the end of each training recording is.
         labels: names of the recordings for messages, train first.
         groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
@@ -83,8 +74,6 @@ def diagnose(
             into none of them again.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
         known_gains: those of the position controllers, where the model lacks them; only without torque.
-        base: body of the model that carries the recorded arm; by default the world, or that of the arm file.
-        tip: body of the model that the recorded arm ends in, where it has several arms.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
     Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`positions`).

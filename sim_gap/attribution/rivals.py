@@ -8,14 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcomp.estimate.choice import PRICE
 from gcomp.estimate.exchange import AS_GOOD as NO_FALL
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
 from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
-from sim_gap.search.term_equations import TermChoice, TermEquations
+from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
-AS_GOOD = 0.036
+AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
 """A rival is as good if its score, per independent measurement, is worse by no more than this: the price of three
 coefficients of a long recording, for the background of every arm can favour either by that much."""
 BARE = AS_GOOD / 3.0
@@ -157,10 +158,7 @@ class LawTest:
         self.laws = [law for law in offered if law in self.choice.effects]
 
     def best_law(self, terms: Sequence[Term]) -> StandIn:
-        """The law that could best replace these terms.
-
-        Either one law replaces all of them, or each term has its own: then the term with the worst replacement counts.
-        """
+        """The law that could best replace these terms: one for all, or one each, of which the worst counts."""
         own = [term for term in self.choice.current if term in terms]
         apart = [self._instead([term]) for term in own]
         found = [max(apart, key=lambda each: each.worse)] if apart else [StandIn(np.inf, "")]

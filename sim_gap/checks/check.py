@@ -35,11 +35,8 @@ WAY_STEP_S = 0.1
 
 
 def goes_one_way(recording: Recording) -> bool:
-    """Whether the joints that move go to and fro less than once, or none moves.
-
-    Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
-    curve as well as the right one does.
-    """
+    """Whether the joints that move go to and fro less than once, or none moves: a wrong column, sign or zero may fit
+    one smooth curve over time as well as the right one does."""
     _, q = _thinned(recording)
     span = np.ptp(q, axis=0)
     moving = span > LEAST_RANGE
@@ -75,16 +72,10 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
 def check_recordings(
     arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
 ) -> tuple[list[Recording], list[RecordingFinding]]:
-    """Correct recordings whose mapping, units or clocks are certainly wrong.
+    """Recordings of one set-up with what is certainly wrong of mapping, units and clocks corrected, and all findings.
 
-    Args:
-        arm: nominal arm, its joints in the recordings' order.
-        recordings: recordings of one set-up, in SI as far as is known.
-        labels: their names for messages.
-        stated: corrections that the user stated, already made; those are not looked into again.
-
-    Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
-    findings. Raises BadInput for times, counts and angles that no arm can have.
+    What is not certain is left as recorded, and what is `stated` is made already and not looked into again. Raises
+    BadInput for times, counts and angles that no arm can have.
     """
     each = [check_recording(arm, r, label, stated) for r, label in zip(recordings, labels, strict=True)]
     columns = {"q", *CHANNELS}
@@ -103,7 +94,7 @@ def check_recordings(
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections, known: Collection[str] = ()
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """Check and correct one recording, as `check_recordings`; `known` are options that corrected others."""
+    """One recording, as in `check_recordings`; `known` are options that corrected others."""
     refuse(label, find_time_unit(recording, stated), find_counts(recording, stated))
     recording, wrapped = unwrap(recording)
     refuse(label, find_jumps(recording, stated))

@@ -16,16 +16,10 @@ FILLERS = {"joint", "joints", "jnt", "motor", "link", "arm", "robot", "actuator"
 def match_joints(
     recording: Recording, model: Sequence[str], stated: Corrections, label: str
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """The recording's joints in the order of the model's, named as there.
+    """The recording's joints in the order of the model's (base to tip), named as there, and a finding where names were
+    matched that differ. Raises BadInput where it is not certain which joint is which.
 
-    Args:
-        recording: with names, or with the default names of a file that has none: then the order of the columns counts.
-        model: names of the model's hinges, base to tip.
-        stated: with `joints`, those are the model's, base to tip, whatever they are called.
-        label: the recording's name for messages.
-
-    Returns the recording and a finding where names were matched that differ. Raises BadInput where it is not certain
-    which joint is which.
+    With `joints` stated, those are the model's, whatever they are called; without names the columns' order counts.
     """
     own = recording.names
     if stated.joints:

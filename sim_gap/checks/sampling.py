@@ -68,10 +68,8 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
         f"{before / max(after, 1e-12):.1f} times smoother: t is the time of receipt, not of measurement"
     )
-    values = {**vars(recording), "t": sampled}
-    return Recording(**values), [
-        RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (to keep the times)", True)
-    ]
+    found = RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (to keep the times)", True)
+    return replace(recording, t=sampled), [found]
 
 
 def _sample_times(t: Array) -> Array | None:

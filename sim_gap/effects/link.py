@@ -41,10 +41,8 @@ def link_rows(signals: PreparedSignals, layout: ChannelLayout, link: int, column
 
 
 def _mass_moment(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
-    """An error of a link's first moment m·s; its inertia about the joint changes with it.
-
-    If only the inertia that comes with it would show, it is an error of the inertia and not of the moment.
-    """
+    """An error of a link's first moment m·s, and with it of its inertia; where that alone would show, none of the
+    moment."""
     own, inertial = signals.link_regressor(place), signals.arm.inertial[place]
     centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
     moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(centre)

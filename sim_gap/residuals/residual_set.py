@@ -27,10 +27,8 @@ EXPLAINED = 0.3
 
 
 def near_impacts(s: PreparedSignals, channel: str, residual: Array) -> dict[int, Mask]:
-    """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each.
-
-    `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.
-    """
+    """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each, from the residual (k, n)
+    of the link-side sensor `channel`."""
     torque = s.filtered(s.reading[channel])
     before, after = (round(seconds * s.rate / s.step) for seconds in (BEFORE_S, AFTER_S))
     out = {}

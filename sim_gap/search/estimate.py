@@ -92,11 +92,9 @@ class EffectEstimate:
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
         step = SHAPE_STEP * abs(term.shape[i])
-        sides = []
-        for sign in (1.0, -1.0):
-            shape = tuple(s + sign * step * (k == i) for k, s in enumerate(term.shape))
-            sides.append(self.store.columns(Term(term.effect, term.place, shape))[row] @ self.of(term))
-        return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+        moved = (term.reshaped(i, term.shape[i] + d) for d in (step, -step))
+        above, below = (self.store.columns(each)[row] @ self.of(term) for each in moved)
+        return np.asarray((above - below) / (2.0 * step))
 
     @cached_property
     def covariance(self) -> Array:

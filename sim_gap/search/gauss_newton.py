@@ -119,11 +119,8 @@ Values = dict[Term, Array]
 def converge(
     nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
 ) -> tuple[ColumnStore, list[Term]]:
-    """Columns of the terms about their own coefficients (`values` of the store), and the terms at their final shapes.
-
-    `nominal` has the columns about the nominal model. `start` holds coefficients to begin with; without it the first
-    step is about the nominal model.
-    """
+    """Columns of the terms about their own coefficients (`values` of the store), and the terms at their final shapes;
+    from the coefficients `start` on, or from the nominal model, which `nominal` has the columns about."""
     terms = [term.start for term in terms]
     values = {term: c for term, c in (start or {}).items() if term in terms}
     best, kept, held = np.inf, values, Values()
