@@ -204,7 +204,6 @@ def causes(
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
-    """Whether some held-out recording has a term."""
     return any(term.form.signature.present(term.shape, s.number) for s in heldout.signals)
 
 

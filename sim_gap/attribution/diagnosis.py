@@ -132,7 +132,6 @@ class Diagnosis:
         return tuple(finding for finding in self.checks if not finding.corrected)
 
     def to_json(self) -> dict[str, Any]:
-        """The dictionary of schema armlink.gap/2."""
         roll: dict[str, Any] = {"horizon_s": None, "closed_loop": False, "before": [], "after": [], "effects": []}
         if self.rollout:
             roll = _fields(self.rollout) | {"effects": [_fields(each) for each in self.rollout.effects]}

@@ -26,8 +26,6 @@ from sim_gap.search.term import Term
 
 @dataclass(frozen=True)
 class CorrectedText:
-    """A corrected model as MJCF."""
-
     xml: str
     lines: tuple[str, ...]
     """A line per effect that it cannot hold, and per link that is not as fitted."""

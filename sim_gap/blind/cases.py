@@ -311,7 +311,6 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
 def make_cases(
     out: str, seed: int, cases: int, workers: int, lengths: Sequence[float], effects: str = "", positions: bool = False
 ) -> None:
-    """Make all cases of a check in folders below `out`, in parallel."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     low, _, high = effects.partition("-")
     wanted = recipes(seed, cases, (int(low), int(high)) if high else None)

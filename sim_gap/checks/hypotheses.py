@@ -180,13 +180,11 @@ def exchangeable(
 
 
 def exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
-    """An order with two places exchanged."""
     places = dict(zip(pair, pair[::-1], strict=True))
     return tuple(order[places.get(j, j)] for j in range(len(order)))
 
 
 def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
-    """Columns of some channels in another order."""
     touched = tuple(j for j, other in enumerate(order) if j != other)
     names = ", ".join(arm.names[j] for j in touched)
     what = (

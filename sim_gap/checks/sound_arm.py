@@ -150,7 +150,6 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    """The same, all at once."""
     q, v, a, read, size, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
         for name in ("q", "v", "a", "reading", "size", "idle", "rubs")

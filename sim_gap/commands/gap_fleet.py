@@ -90,7 +90,6 @@ def diagnose_fleet(
 
 
 def _show(rows: list[dict[str, Any]], console: Any) -> None:
-    """Print how often each effect was found and on how many arms, then the cases that could not be diagnosed."""
     from rich.table import Table
 
     cases = {row["case"]: row["verdict"] for row in rows}
@@ -111,7 +110,6 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
 
 
 def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
-    """Print what changes on which arm, and which arm differs from the others."""
     from rich.table import Table
 
     if trends:

@@ -58,7 +58,6 @@ def _smooth_in_velocity(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
 
 
 def _body(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
-    """The ten inertial parameters of a body fixed to a link."""
     return link_rows(signals, layout, place, signals.link_regressor(place))
 
 

@@ -52,7 +52,6 @@ def _stays_behind(torque: Array, shape: Shape) -> Array:
 
 
 def is_gradual(shape: Shape) -> bool:
-    """Whether a hysteresis of this shape sets in gradually."""
     return len(shape) > 1
 
 

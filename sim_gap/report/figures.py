@@ -75,7 +75,6 @@ def gap_bars(answer: Diagnosis) -> Any:
 
 
 def rollout_bars(names: tuple[str, ...], rollout: Rollout) -> Any:
-    """Bars per joint: position gap of the forward simulation before and after."""
     title = f"Position gap of the forward simulation over {rollout.horizon_s:.2g} s"
     return _bars(names, rollout.before, rollout.after, "RMS [rad]").update_layout(title=title, height=340)
 

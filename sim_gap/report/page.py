@@ -31,7 +31,6 @@ PARAMETERS = {
 
 
 def sections(answer: Diagnosis) -> list[Section]:
-    """Sections for a separate page or for a part of another report."""
     out = [_verdict(answer), _gap(answer)]
     if isinstance(answer.internals, Identified):
         out += _motion(answer.internals, answer.causes)

@@ -86,7 +86,6 @@ class ResidualSet:
 
     @property
     def parts(self) -> list[slice]:
-        """Samples of each recording."""
         return [
             slice(end - length, end) for end, length in zip(np.cumsum(self.lengths).tolist(), self.lengths, strict=True)
         ]

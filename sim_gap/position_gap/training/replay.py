@@ -155,7 +155,6 @@ def commanded_rows(recording: Recording, longest: float = LONGEST_S) -> list[sli
 
 
 def actuator_of(model: Any, joint: int) -> int:
-    """Number of the actuator that drives a joint."""
     import mujoco
 
     own = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
