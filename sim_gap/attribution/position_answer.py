@@ -139,7 +139,7 @@ def _is_within(found: Identified) -> bool:
     within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
     moved = found.moved_train, found.moved_before
     within = within or all(bool(np.all(gap < found.margin)) for gap in moved)
-    return within or (found.sound is not None and found.sound.explained)
+    return within or found.sound
 
 
 def _is_small(found: Identified) -> bool:

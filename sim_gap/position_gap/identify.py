@@ -26,7 +26,7 @@ from sim_gap.position_gap.choice import (
 )
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
 from sim_gap.position_gap.plant import MovedModel, nominal_point
-from sim_gap.position_gap.sound_arm import SoundGap, split_gap
+from sim_gap.position_gap.sound_arm import sound_gap
 from sim_gap.position_gap.start import limited_servo_start, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
@@ -67,8 +67,8 @@ class Identified:
     heldout_before: Array
     heldout_after: Array
     margin: Array
-    sound: SoundGap | None
-    """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
+    sound: bool
+    """Whether a sound arm may have the nominal model's gap; not known if the controller had to be found."""
     moved_train: Array
     """RMS gap of the nominal model that runs free along the training commands [rad]; NaN if the controller had to be
     found, or none is commanded long enough."""
@@ -134,9 +134,8 @@ def identify(
     search, fit, about = _fitted(search, complete, progress)
     progress("testing each effect on held-out data")
     margin = _margin(search, fit)
-    split = split_gap(search, judged, margin) if complete else None
-    matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    found = tuple(stages(search, fit, about, judged, matters))
+    usual, sound = sound_gap(search, judged, margin) if complete else (np.zeros(sim.n), False)
+    found = tuple(stages(search, fit, about, judged, np.maximum(margin, 2.0 * usual)))
     before = _bare(search, fit, about, complete)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
@@ -155,7 +154,7 @@ def identify(
         heldout_before=rms_on(judged, before.point),
         heldout_after=rms_on(judged, fit.point),
         margin=margin,
-        sound=split,
+        sound=sound,
         moved_train=moved_train,
         moved_before=moved,
         recordings=tuple(heldout),

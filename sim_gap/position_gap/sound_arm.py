@@ -6,7 +6,7 @@ make of the gap; what they leave, and how improbable they are, says whether ther
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -28,18 +28,6 @@ PROBABLE = 0.99
 """Share of sound arms whose errors are less improbable."""
 LEAST_SHOWN = 0.5
 """Least share of its variance by which an error is judged by itself: what shows less takes on what others leave."""
-
-
-@dataclass(frozen=True, eq=False)
-class SoundGap:
-    """The gap of the nominal model beside what small errors of its parameters make, (J,) each [rad]."""
-
-    usual: Array
-    """RMS of the gap that errors of one standard deviation each make together."""
-    left: Array
-    """RMS that remains with the most probable errors, in training or held-out recordings, whichever is more margins."""
-    explained: bool
-    """Whether a sound arm may have these errors, and they leave nothing that matters."""
 
 
 def omitted_of(search: LoopSearch) -> dict[str, Array]:
@@ -65,8 +53,12 @@ def errors_of(search: LoopSearch) -> dict[Place, float]:
     return out | {(-1, f"moment{link}.{axis}"): size for link, size in enumerate(moments.tolist()) for axis in "xyz"}
 
 
-def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
-    """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
+def sound_gap(search: LoopSearch, heldout: Windows, margin: Array) -> tuple[Array, bool]:
+    """RMS of the gap that errors of one standard deviation each make together, (J,) [rad]; and whether a sound arm may
+    have the errors that make the nominal model's gap most probable, and they leave nothing that matters.
+
+    `margin` is the RMS that counts as a gap at each joint, (J,) [rad].
+    """
     sizes = errors_of(search)
     usually = _correlation(sizes)
     prior = np.linalg.inv(usually)
@@ -82,8 +74,7 @@ def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     found = layout.at(layout.theta(layout.point) + np.array([*sizes.values()]) * errors)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
-    explained = all(small) and probable(errors, usually, spread)
-    return SoundGap(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
+    return usual, all(small) and probable(errors, usually, spread)
 
 
 def probable(errors: Array, usually: Array, spread: Array) -> bool:
