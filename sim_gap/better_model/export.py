@@ -45,12 +45,8 @@ def model_files(
     spec: Any = None,
     mount: float = 0.0,
 ) -> CorrectedText:
-    """The text of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
-
-    A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
-    `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
-    it is copied.
-    """
+    """The text of the model as `with_effects` makes it; `name` is the MJCF's. `laws` are torques without a known cause;
+    `spec` is the nominal model's if it has been read before."""
     chosen = estimate.terms if terms is None else tuple(terms)
     if spec is None:
         spec = named_spec(sim)
@@ -81,12 +77,8 @@ def model_files(
 
 
 def write_model(sim: SimModel, estimate: EffectEstimate, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
-    """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
-
-    The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
-    lists them in a comment. A module of an earlier model of that name is removed if there is none now. Raises BadInput
-    if the nominal model did not come from a file or a file cannot be written.
-    """
+    """Write the model with the effects, and beside it a module for those that MJCF cannot hold and for laws; a line for
+    each of them. Raises BadInput if the nominal model did not come from a file, or as `write_files`."""
     files = model_files(sim, estimate, path.name, laws=laws)
     beside = {module_path(path): module_text(sim, files.effects, path.name) if files.effects else None}
     return write_files(path, sim, files.xml, files.spec.compile, files.lines, beside)

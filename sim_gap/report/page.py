@@ -39,8 +39,8 @@ def sections(answer: Diagnosis) -> list[Section]:
     return out
 
 
-def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", subtitle: str = "") -> None:
-    render(path, title, sections(answer), subtitle)
+def write_report(answer: Diagnosis, path: Path, subtitle: str = "") -> None:
+    render(path, "Sim-to-real gap", sections(answer), subtitle)
 
 
 def _verdict(answer: Diagnosis) -> Section:

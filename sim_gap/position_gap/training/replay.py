@@ -64,10 +64,9 @@ def model_without(sim: SimModel, search: LoopSearch, made: Exported, groups: Seq
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
     """Times (K,), simulated and measured positions (K, n) of the parts of a recording that are commanded without a
-    break; nothing of one without commands.
+    break, for at most `longest` [s] in all.
 
-    Each part begins at its first measured position at rest, under a command that keeps it there (`hold`); each joint's
-    actuator gets the command held from row to row, for at most `longest` [s] in all.
+    Each part begins at its first measured position at rest, under a command that keeps it there (`hold`).
     """
     none = recording.position[:0]
     parts = [(recording.t[:0], none, none)]

@@ -290,10 +290,8 @@ def draw(
     search: LoopSearch, fit: LoopFit, spread: Covariance, count: int, seed: int = 0, reach: Array | None = None
 ) -> list[dict[str, float]]:
     """Draws of all parameters from their joint distribution, within their bounds, and of the limits that no recording
-    reaches: `joint.name` → value.
-
-    The distribution is one of small steps. A draw whose motion is further from the fit's than `reach` (J,) [rad], RMS
-    over the training motion to first order, is shortened.
+    reaches: `joint.name` → value. One whose training motion is further from the fit's than `reach` (J,) [rad, RMS], to
+    first order, is shortened, for the distribution is one of small steps.
     """
     random = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(spread.matrix)
