@@ -54,8 +54,8 @@ def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> Residual
     known = {s.number: s for s in train}
     if body is None or all(s.number in known for s in heldout.signals):
         return heldout
-    with_it = next(s for s in train if body.form.signature.present(body.shape, s.number))
-    others = [s.groups for s in train if body.form.signature.present(body.shape, s.number)]
+    with_it = next(s for s in train if body.present(s.number))
+    others = [s.groups for s in train if body.present(s.number)]
     out = []
     for s in heldout.signals:
         if s.number in known:
@@ -88,7 +88,7 @@ def mounts(estimate: EffectEstimate) -> tuple[float, ...]:
     """Angle by which the body is turned in each training recording against the first that has it [rad]."""
     body, data = body_of(estimate), estimate.store.data
     angles = [s.mount for s in data.signals]
-    have = [k for k, s in enumerate(data.signals) if body and body.form.signature.present(body.shape, s.number)]
+    have = [k for k, s in enumerate(data.signals) if body and body.present(s.number)]
     owns = [_own(estimate, estimate.store, body, k)[0] for k in have] if body and len(have) > 1 else []
     for k, own in zip(have, owns, strict=False):
         angle = _turn(data.signals[k], owns[0], own)
@@ -140,7 +140,7 @@ def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet)
         others = [(k, s) for k, s in enumerate(heldout.signals) if s.number not in known]
         owns = {k: _own(estimate, estimate.on(ResidualSet((s,), heldout.layout)), trial, 0) for k, s in others}
         return [k for k, (_, left) in owns.items() if left < OF_A_BODY]
-    if not all(body.form.signature.present(body.shape, number) for number in known):
+    if not all(body.present(number) for number in known):
         return []
     return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]
 
@@ -158,7 +158,5 @@ def _left(estimate: EffectEstimate, data: ResidualSet) -> float:
 
 def recordings_with(term: Term, sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     """Labels of the recordings that have a term; empty if all of them do."""
-    every = list(
-        dict.fromkeys((s.label, term.form.signature.present(term.shape, s.number)) for d in sets for s in d.signals)
-    )
+    every = list(dict.fromkeys((s.label, term.present(s.number)) for d in sets for s in d.signals))
     return () if all(present for _, present in every) else tuple(label for label, present in every if present)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs
-from sim_gap.attribution.rivals import LawTest, Rivals
+from sim_gap.attribution.rivals import LawTest, Rivals, separating_motion
 from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Row
@@ -204,7 +204,7 @@ def causes(
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
-    return any(term.form.signature.present(term.shape, s.number) for s in heldout.signals)
+    return any(term.present(s.number) for s in heldout.signals)
 
 
 def _cause(
@@ -215,9 +215,9 @@ def _cause(
     places = sorted({term.place for term in terms})
     whole = effects()[step.effect].signature.whole_arm
     touched = np.arange(len(names)) if whole else np.array(places)
-    weighed = rivals.weigh(step.effect, terms)
-    stand_in = law_test.best_law(terms)
-    signs = scorer.signs(terms, weighed.evidence, stand_in.worse)
+    evidence, confounded = rivals.weigh(step.effect, terms)
+    outside, law = law_test.best_law(terms)
+    signs = scorer.signs(terms, evidence, outside)
     parameters: dict[str, dict[str, Value]] = {}
     for term in sorted(terms, key=lambda t: t.place):
         parameters.setdefault("arm" if whole else names[term.place], {}).update(scorer.estimate.parameters(term))
@@ -227,12 +227,12 @@ def _cause(
         parameters=parameters,
         gap_before=float(np.sqrt(np.mean(step.before[touched] ** 2))),
         gap_after=float(np.sqrt(np.mean(step.after[touched] ** 2))),
-        confidence=confidence(signs, len(weighed.confounded_with)),
+        confidence=confidence(signs, len(confounded)),
         fall=step.fall,
         signs=signs,
-        confounded_with=weighed.confounded_with,
-        separate_by=weighed.separate_by,
-        law=stand_in.law,
+        confounded_with=confounded,
+        separate_by=separating_motion(step.effect, confounded),
+        law=law,
     )
 
 

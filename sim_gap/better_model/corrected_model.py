@@ -12,7 +12,6 @@ from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.model.load import SimModel, named_spec
-from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
@@ -78,7 +77,7 @@ def with_effects(
         *(term for term in chosen if term.effect == "transmission.coupling" and not coupled),
         *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
     }
-    held = tuple(term for term in chosen if term.effect in HELD and in_model(term, number) and term not in left_out)
+    held = tuple(term for term in chosen if term.effect in HELD and term.present(number) and term not in left_out)
     turn = mount_matrix(sim.arm.axis[-1], mount)
     links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
     changed = _set_links(model, sim, links, number)
@@ -138,13 +137,6 @@ def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
 
 def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
-
-
-def in_model(term: Term, number: int) -> bool:
-    """Whether a term belongs to the arm, or to the recording with this number."""
-    return not (term.bound or (number == ABSENT and term.form.signature.body)) or term.form.signature.present(
-        term.shape, number
-    )
 
 
 def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> tuple[Any, bool]:

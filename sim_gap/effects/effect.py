@@ -9,7 +9,7 @@ import numpy as np
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import ChannelLayout, Columns
-from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 Shape = tuple[float, ...]
 """Nonlinear parameters of an effect, such as its Stribeck velocity."""
@@ -79,11 +79,6 @@ class Signature:
 
     slopes: Callable[[PreparedSignals, ChannelLayout, Shape, Array], Columns] | None = None
     """Of a nonlinear effect: its columns about fitted coefficients."""
-
-    def present(self, shape: Shape, number: int) -> bool:
-        """Whether recording `number` has it: what belongs to the arm is in all of them, a body not in those without."""
-        numbers = self.recordings(shape)
-        return not self.body if number == ABSENT else not numbers or number in numbers
 
     def places(self, layout: ChannelLayout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""

@@ -138,7 +138,7 @@ def inertial_change(term: Term, c: Array, inertial: Array, number: int) -> Array
     if term.effect == "link.inertia":
         return np.asarray(np.concatenate([np.zeros(4), c]))
     if term.effect == "link.payload":
-        return np.asarray(point_mass(float(c[0]), c[1:]) * term.form.signature.present(term.shape, number))
+        return np.asarray(point_mass(float(c[0]), c[1:]) * term.present(number))
     return None
 
 
