@@ -11,7 +11,7 @@ from gcomp.arm.inertials import body_parameters, fixed_body_parameters, pseudo_i
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_gap.effects.link import mount_matrix, tilt_gravity
-from sim_gap.model.load import SimModel, named_spec
+from sim_gap.model.load import SimModel, links_of_bodies, named_spec
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
@@ -113,7 +113,8 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
     total = body_parameters(model, body, anchor, np.eye(3)) + added
     if not may_exist(total):
-        fixed, data = _fixed_to(model, body, joints), mujoco.MjData(model)
+        links, data = links_of_bodies(model, joints), mujoco.MjData(model)
+        fixed = [other for other, own in enumerate(links) if own == link and other != body]
         mujoco.mj_kinematics(model, data)
         beside = (fixed_body_parameters(model, data, other, body, anchor) for other in fixed)
         whole = total + sum(beside, np.zeros(10))
@@ -122,17 +123,6 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
             for other in fixed:
                 model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
     return set_body(model, body, anchor, total)
-
-
-def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
-    """Bodies without a joint of their own among `joints` that are carried by this one without one in between."""
-    moving = {int(model.jnt_bodyid[joint]) for joint in joints}
-    out: list[int] = []
-    for other in range(body + 1, model.nbody):
-        up = int(model.body_parentid[other])
-        if other not in moving and (up == body or up in out):
-            out.append(other)
-    return out
 
 
 def may_exist(inertial: Array) -> bool:

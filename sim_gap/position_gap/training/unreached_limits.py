@@ -77,7 +77,9 @@ def _torques(search: LoopSearch, fit: LoopFit) -> Array:
     error = data.error - residuals(data, [point])[0]
     kp, inner = (point[name][:, None] for name in ("kp", "kv"))
     damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
-    return _highest(search, np.abs(kp * error * data.scale - damping * data.v))
+    counted = data.weight * data.served > 0.0
+    asked = np.where(counted, np.abs(kp * error * data.scale - damping * data.v), 0.0)
+    return np.asarray(asked.max(axis=(0, 2)))
 
 
 def _command_speeds(search: LoopSearch) -> Array:
@@ -90,13 +92,6 @@ def _command_speeds(search: LoopSearch) -> Array:
             speed = np.abs(np.diff(held, axis=0)) / np.diff(piece.ends[:-1])[:, None]
             out = np.maximum(out, speed.max(axis=0))
     return out
-
-
-def _highest(search: LoopSearch, values: Array) -> Array:
-    counted = search.data.weight * search.data.served > 0.0
-    return np.array(
-        [float(values[:, j][counted[:, j]].max()) if counted[:, j].any() else 0.0 for j in range(search.data.joints)]
-    )
 
 
 def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:
