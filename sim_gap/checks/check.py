@@ -122,7 +122,7 @@ def _with_right_columns(
     other."""
     found, s = list[RecordingFinding](), _prepared(recording, arm, label, stated)
     for channel in CHANNELS:
-        while channel in s.channels and len(found) < 2 * arm.n:
+        while channel in s.reading and len(found) < 2 * arm.n:
             motion = motion_of(s, channel)
             silent = motion.reading.std(0) < SIGNIFICANT * s.noise[channel]
             if silent.all():  # an arm that swings, its drives off

@@ -105,10 +105,9 @@ def find_wrong_columns(
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
     """Fall of the cost by each hypothesis, less the price, on some of the rows, (M,)."""
-    few = slice(None, None, max(1, len(motion.q) // SCREENING_ROWS))
     changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
     moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]
-    motions = [each.rows(few) for each in changed]
+    motions = [each.thinned(SCREENING_ROWS) for each in changed]
     made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
     models = dict(zip(moved, np.split(made, len(moved)), strict=True))
     costs = quick_costs(arm, np.array([models.get(k, models[0]) for k in range(len(motions))]), motions)
@@ -146,7 +145,7 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of more than two columns, of positions, of torques and of both: exchange after exchange from those that
     explain most after the one before; none where no exchange explains more than the order as it is recorded."""
-    found, few = list[Hypothesis](), motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
+    found, few = list[Hypothesis](), motion.thinned(ORDER_ROWS)
     for channels, joints in exchangeable(arm, motion, follows):
         orders = [tuple(range(arm.n))]
         for _ in joints[1:MOST_CANDIDATES]:

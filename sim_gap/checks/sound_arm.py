@@ -50,8 +50,10 @@ class ChannelMotion:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
         return _telling(self.v, self.reading, self.channel == "tau")
 
-    def rows(self, rows: slice) -> "ChannelMotion":
-        q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
+    def thinned(self, count: int) -> "ChannelMotion":
+        """Some `count` of its rows or more, evenly spread."""
+        step = max(1, len(self.q) // count)
+        q, v, a, reading = (x[::step] for x in (self.q, self.v, self.a, self.reading))
         return replace(self, q=q, v=v, a=a, reading=reading)
 
 
@@ -66,7 +68,7 @@ def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     thin = slice(None, None, max(1, len(t) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
     size, idle = reading.std(0), np.ones(reading.shape[1], bool)
-    rubs = channel != "tau" or "tau_motor" in s.channels
+    rubs = channel != "tau" or "tau_motor" in s.reading
     return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, idle, rubs)
 
 

@@ -175,7 +175,7 @@ def _starts(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...
     nominal = signals[0].arm.gravity
     gram, side = 1e-9 * np.eye(3), np.zeros(3)
     for s in signals:
-        channel = "tau" if "tau" in s.reading else s.channels[0]
+        channel = "tau" if "tau" in s.reading else next(iter(s.reading))
         for joint in range(s.n):
             moved = np.column_stack([np.ones(len(s.t)), s.direction[:, joint], s.v[:, joint]])
             columns = np.column_stack([s.gravity_columns[:, joint], s.reading[channel][:, joint] - s.model[:, joint]])

@@ -135,7 +135,7 @@ def look_about(
     places = [(j, name) for j, name in places if name != "stribeck_velocity" or (j, "stribeck") in fit.free]
     layout = Layout(search, point, places)
     problem = layout.problem(steps)
-    about = linearise(problem, layout.theta(layout.point), range(len(places)))
+    about = linearise(problem, layout.theta, range(len(places)))
     at = {place: k for k, place in enumerate(places)}
     effects: dict[Group, Effect[Group]] = {}
     for group in listed:
@@ -200,7 +200,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
     layout = Layout(search, fit.point, fit.free)
-    unlikely = prior_cost(layout.problem(), layout.theta(layout.point), search.data.joints).sum()
+    unlikely = prior_cost(layout.problem(), layout.theta, search.data.joints).sum()
     paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in fit.free)
     return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
 

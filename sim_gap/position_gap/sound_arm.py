@@ -71,7 +71,7 @@ def sound_gap(search: LoopSearch, heldout: Windows, margin: Array) -> tuple[Arra
     spread = np.asarray(np.linalg.inv(normal))
     errors = spread @ right
     layout, other = Layout(search, search.nominal, [*sizes]), replace(search, data=heldout)
-    found = layout.at(layout.theta(layout.point) + np.array([*sizes.values()]) * errors)
+    found = layout.at(layout.theta + np.array([*sizes.values()]) * errors)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
     return usual, all(small) and probable(errors, usually, spread)

@@ -94,7 +94,7 @@ class ChannelLayout:
 
 def layout_of(signals: list[PreparedSignals]) -> ChannelLayout:
     """The channels that all recordings have, and the best reference of each joint's command."""
-    common = set.intersection(*(set(s.channels) for s in signals))
+    common = set.intersection(*(set(s.reading) for s in signals))
     sensor = "tau" if "tau" in common else None
     motor = next((channel for channel in ("tau_motor", "tau_cmd") if channel in common), None)
     command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None

@@ -237,7 +237,7 @@ def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> 
 
 def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
     """Change of a parameter's own coordinate per relative change of it, (K,)."""
-    own = Layout(search, fit.point, names).theta(fit.point)
+    own = Layout(search, fit.point, names).theta
     return np.where([name in LOGARITHMIC for _, name in names], 1.0, own)
 
 
@@ -268,7 +268,7 @@ def interval(
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
     half = min(half, ANYTHING) if name in LOGARITHMIC else half
     layout = Layout(search, fit.point, [(joint, name)])
-    problem, about = layout.problem(), layout.theta(fit.point)
+    problem, about = layout.problem(), layout.theta
     points = [fit.point, *(layout.at(problem.within(about + step)) for step in (-half, half))]
     value, *ends = (float(point[name][max(joint, 0)]) for point in points)
     unit = PARAMETERS[name].unit if joint >= 0 else UNIT[name.partition(".")[2]]
@@ -300,7 +300,7 @@ def draw(
     if reach is not None:
         steps = _within(search, fit, spread, steps, reach)
     layout = Layout(search, fit.point, spread.names)
-    problem, about = layout.problem(), layout.theta(layout.point)
+    problem, about = layout.problem(), layout.theta
     points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
     for each in spread.limits:
