@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.answer import Internals
+from sim_gap.attribution.diagnose import Internals
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.effects.registry import effects
 from sim_gap.search.estimate import EffectEstimate

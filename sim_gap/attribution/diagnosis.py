@@ -124,7 +124,7 @@ class Diagnosis:
     checks: tuple[RecordingFinding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
-    """Fit and data behind the result (`answer.Internals`), for report and export."""
+    """Fit and data behind the result (`diagnose.Internals`), for report and export."""
 
     @property
     def doubts(self) -> tuple[RecordingFinding, ...]:
