@@ -39,9 +39,8 @@ from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
 from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps, without_disturbances
-from sim_gap.residuals.location import by_joint, locate, row_rms
 from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
-from sim_gap.residuals.residual_set import ResidualSet, residual_sets
+from sim_gap.residuals.residual_set import ResidualSet, by_joint, locate, residual_sets, row_rms
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import AGAIN, ROUNDS, select_model

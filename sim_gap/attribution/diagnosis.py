@@ -10,7 +10,7 @@ from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.position_gap.training.bands import SHARE, Band
-from sim_gap.residuals.location import Location
+from sim_gap.residuals.residual_set import Location
 from sim_gap.search.estimate import Value
 
 HINT = 0.5

@@ -27,8 +27,7 @@ from sim_gap.position_gap.training.replay import (
     simulated_model,
 )
 from sim_gap.position_gap.training.spread import interval, payload_centre
-from sim_gap.residuals.location import Location
-from sim_gap.residuals.residual_set import EXPLAINED
+from sim_gap.residuals.residual_set import EXPLAINED, Location
 from sim_gap.search.estimate import Value
 
 ALMOST = 0.75

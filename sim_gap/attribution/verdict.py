@@ -13,8 +13,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs, Verdict
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.location import row_rms
-from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet
+from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet, row_rms
 
 WEIGHTS = {"constant": -3.37, "evidence": 0.42, "left": -0.87, "elsewhere": -2.9, "outside": 1.3}
 """Weights of the constant and of each feature."""

@@ -14,7 +14,7 @@ from sim_gap.attribution.residual_laws import ResidualLaw, _LawCandidate
 from sim_gap.attribution.rollout import RollOuts
 from sim_gap.better_model.export import _line
 from sim_gap.residuals.layout import ChannelLayout
-from sim_gap.residuals.location import Location, _features
+from sim_gap.residuals.residual_set import Location, _features
 from sim_gap.search.estimate import Value
 from sim_gap.search.term import Term
 
