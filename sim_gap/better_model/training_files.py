@@ -15,7 +15,7 @@ from armlink.errors import BadInput
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_bus.effects.registry import effects as simulated
-from sim_gap.better_model.corrected_model import with_effects
+from sim_gap.better_model.export import with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term

@@ -14,8 +14,7 @@ from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
 from calib.arm.model_files import xml_comment
 from gcomp.arrays import Array, Mask
-from sim_gap.better_model.corrected_model import write_changes
-from sim_gap.better_model.export import CorrectedText
+from sim_gap.better_model.export import CorrectedText, write_changes
 from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import put_delay
 from sim_gap.model.load import SimModel, named_spec
