@@ -13,8 +13,7 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.position_answer import _lowers, _verdict
-from sim_gap.attribution.position_notes import _beyond, _faster, _released
+from sim_gap.attribution.position_answer import _beyond, _faster, _lowers, _released, _verdict
 from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.export import export_with_module
