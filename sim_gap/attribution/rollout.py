@@ -80,10 +80,7 @@ def roll_out(
     causes: Sequence[Cause],
     laws: Sequence[JointEffect] = (),
 ) -> Rollout:
-    """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
-
-    Effects whose absence costs most come first.
-    """
+    """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out."""
     runs = RollOuts(sim, heldout, recordings, estimate, laws)
     horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
     before = runs.of((), windows)

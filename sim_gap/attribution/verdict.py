@@ -73,10 +73,7 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
 
 
 def is_closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
-    """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row.
-
-    A row is near the noise within NEAR times its margin, or with no more than ROW_LEFT of its own RMS left.
-    """
+    """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row."""
     before, after = row_rms(data), row_rms(data, left)
     near = all(rms <= max(NEAR * data.margin[row], ROW_LEFT * before[row]) for row, rms in after.items())
     return near and float(np.sqrt(share_left(data, left))) <= EXPLAINED

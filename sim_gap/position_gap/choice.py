@@ -167,10 +167,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
 
 
 def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
-    """Choose effects about the fit and fit them, until the choice stays; the best fit.
-
-    After the first time only those are looked at that were worth their price by themselves or are there.
-    """
+    """Choose effects about the fit and fit them, until the choice stays; the best fit."""
     names = chosen_of(search, fit)
     kept = [each for each in candidates_of(search) if each[0] in search.kept]
     looked = {*names, *unexplained_at(search, fit)}

@@ -43,16 +43,12 @@ class ChannelLayout:
     @property
     def against_model(self) -> str:
         """The channel in which errors of links and positions show: the sensor's, else the motor's."""
-        channel = self.sensor or self.motor
-        assert channel is not None
-        return channel
+        return str(self.sensor or self.motor)
 
     @property
     def motor_side(self) -> str:
         """The channel in which friction shows: the motor's, else the sensor's."""
-        channel = self.motor or self.sensor
-        assert channel is not None
-        return channel
+        return str(self.motor or self.sensor)
 
     @property
     def commanded(self) -> str | None:

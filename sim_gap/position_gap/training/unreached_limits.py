@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
+from gcomp.estimate.choice import SIGNIFICANT
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 
 HEADROOM = 10.0
@@ -19,7 +20,7 @@ and all of what a drive can do."""
 ABOVE = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """Levels that are tried, over what the training motion asks for: commands are held from row to row, so that a limit of
 their speed shows far above it."""
-COSTS = 2.0
+COSTS = 0.5 * SIGNIFICANT**2
 """Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
 LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
 """Parameter that is a limit → its effect."""
