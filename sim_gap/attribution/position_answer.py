@@ -115,8 +115,8 @@ def _lowers(found: Identified, stage: Stage) -> bool:
 def _differs(found: Identified, stage: Stage) -> bool:
     """Whether some parameter's interval leaves out the nominal value."""
     for j, name in found.search.places_of(stage.group):
-        _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
-        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
+        own = interval(found.search, found.fit, found.within, j, name)
+        if not own.low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= own.high:
             return True
     return False
 
@@ -192,14 +192,14 @@ def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
     if not joints:
         columns = [name for _, name in found.search.places_of(stage.group)]
         place = effect.partition("@")[2] or "arm"
-        values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
+        values = {c.partition(".")[2]: interval(found.search, found.fit, found.spread, -1, c) for c in columns}
         if effect == "link.payload":
-            values |= {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
+            values |= {c.partition(".")[2]: payload_centre(found.fit, found.spread, c) for c in columns[1:]}
         return {place: values}
     own = EFFECTS[effect]
     return {
         found.sim.arm.names[j]: {
-            called: Value(*interval(found.search, found.fit, found.spread, j, name))
+            called: interval(found.search, found.fit, found.spread, j, name)
             for name, called in zip(own.parameters, own.reported, strict=True)
         }
         for j in joints
@@ -325,9 +325,9 @@ def _early(found: Identified) -> list[str]:
     for j in range(found.sim.n):
         if "delay" not in found.fit.at(j):
             continue
-        value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
-        if high < 0.0:
-            early[found.sim.arm.names[j]] = value
+        late = interval(found.search, found.fit, found.within, j, "delay")
+        if late.high < 0.0:
+            early[found.sim.arm.names[j]] = late.value
     if not early:
         return []
     period, time = found.heldout.period, float(np.median([*early.values()]))
