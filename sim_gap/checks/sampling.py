@@ -175,8 +175,9 @@ HELD = 0.3
 
 def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with positions that were read less often than the rows come, and repeated, filled in between."""
-    same = _repeats(recording.position) & fast_rows(recording.position)
-    share = float(same.sum()) / max(float(fast_rows(recording.position).sum()), 1.0)
+    fast = fast_rows(recording.position)
+    same = _repeats(recording.position) & fast
+    share = float(same.sum()) / max(float(fast.sum()), 1.0)
     if share < HELD:
         return recording, []
     velocity, known = recording.velocity, np.repeat(~same[:, None], recording.n, axis=1)
