@@ -31,11 +31,11 @@ from sim_gap.checks.check import (
     check_position_only,
     check_recordings,
     is_position_only,
+    match_joints,
     times_in_motion,
     unchecked_note,
 )
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
 from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps, without_disturbances

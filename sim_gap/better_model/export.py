@@ -21,8 +21,8 @@ from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.effects.torque import GRADUAL, is_gradual
 from sim_gap.model.load import SimModel, links_of_bodies, named_spec, urdf_behind
+from sim_gap.search.column_store import inertial_change
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
 
 
@@ -123,7 +123,7 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
     total = body_parameters(model, body, anchor, np.eye(3)) + added
     if not may_exist(total):
         links, data = links_of_bodies(model, joints), mujoco.MjData(model)
-        fixed = [other for other, own in enumerate(links) if own == link and other != body]
+        fixed = [other for other, own in enumerate(links) if own == links[body] and other != body]
         mujoco.mj_kinematics(model, data)
         beside = (fixed_body_parameters(model, data, other, body, anchor) for other in fixed)
         whole = total + sum(beside, np.zeros(10))

@@ -14,8 +14,7 @@ from gcomp.arm.inertials import pseudo_inertia
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.exchange import AS_GOOD
-from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate_signals import inertial_change
+from sim_gap.search.column_store import ColumnStore, inertial_change
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
 
