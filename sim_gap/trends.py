@@ -225,10 +225,13 @@ def _of_arm(arm: str, answers: Sequence[tuple[datetime, Values]]) -> dict[Key, _
             if (arm, *which) not in out:
                 out[arm, *which] = _Series(unit, dates, *np.full((2, len(dates)), np.nan))
             out[arm, *which].values[k], out[arm, *which].interval[k] = value, half
-    for one in out.values():
-        if one.watched:
-            one.values[one.interval > CLEAR * np.nanmedian(one.interval)] = np.nan
-    return out
+    return {key: _without_unclear(one) for key, one in out.items()}
+
+
+def _without_unclear(one: _Series) -> _Series:
+    if one.watched:
+        one.values[one.interval > CLEAR * np.nanmedian(one.interval)] = np.nan
+    return one
 
 
 def _watched_values(answer: Mapping[str, Any]) -> Values:
