@@ -80,10 +80,10 @@ def with_effects(
     `mount` about the last joint's axis [rad].
     """
     chosen = estimate.terms if terms is None else tuple(terms)
-    model, coupled = _base(sim, estimate, chosen)
+    model = _base(sim, estimate, chosen)
     bent = {term.place for term in chosen if term.effect in OF_READING}
     left_out = {
-        *(term for term in chosen if term.effect == "transmission.coupling" and not coupled),
+        *(term for term in chosen if term.effect == "transmission.coupling" and sim.path is None),
         *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
     }
     held = tuple(term for term in chosen if term.effect in HELD and term.present(number) and term not in left_out)
@@ -138,13 +138,13 @@ def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
 
 
-def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> tuple[Any, bool]:
-    """A copy of the nominal model with its coupled motors, and whether it has any (only a model from a file can)."""
+def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> Any:
+    """A copy of the nominal model with its coupled motors, which only a model from a file can have."""
     if sim.path is None or not any(term.effect == "transmission.coupling" for term in terms):
-        return copy.copy(sim.mujoco_model), False
+        return copy.copy(sim.mujoco_model)
     spec = named_spec(sim)
     add_motors(spec, sim, estimate, terms)
-    return spec.compile(), True
+    return spec.compile()
 
 
 def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
