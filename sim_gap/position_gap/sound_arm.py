@@ -54,8 +54,8 @@ def errors_of(search: LoopSearch) -> dict[Place, float]:
 
 
 def sound_gap(search: LoopSearch, heldout: Windows, margin: Array) -> tuple[Array, bool]:
-    """RMS of the gap that errors of one standard deviation each make together, (J,) [rad]; and whether a sound arm may
-    have the errors that make the nominal model's gap most probable, and they leave nothing that matters.
+    """RMS of the gap that errors of one standard deviation each make together, (J,) [rad]; and whether small errors
+    explain the nominal model's gap: a sound arm may have the most probable ones, and they leave nothing that matters.
 
     `margin` is the RMS that counts as a gap at each joint, (J,) [rad].
     """
