@@ -14,7 +14,7 @@ from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
 from calib.arm.model_files import xml_comment
 from gcomp.arrays import Array, Mask
-from sim_gap.better_model.export import CorrectedText, write_changes
+from sim_gap.better_model.export import HELD, CorrectedText, write_changes
 from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import put_delay
 from sim_gap.model.load import SimModel, named_spec
@@ -55,14 +55,8 @@ NATIVE = {
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
     "actuator.back_emf": "actuator kv",
-    "actuator.rotor_inertia": "joint armature",
-    "friction.coulomb": "joint frictionloss",
-    "friction.viscous": "joint damping",
     "friction.creep": "joint solimpfriction",
-    "transmission.spring": "joint stiffness and springref",
-    "link.payload": "body inertial",
-    "link.mass_moment": "body inertial",
-    "base.tilt": "option gravity",
+    **{name: HELD[name] for name in HELD if name in {*EFFECTS, "link.payload", "link.mass_moment", "base.tilt"}},
 }
 """Effects that a field of MJCF holds."""
 BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
