@@ -1,6 +1,5 @@
 """Diagnoses the recordings of a fleet on a cluster of workers, and those of one arm in turn."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -126,9 +125,6 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
         )
 
 
-UNDATED = datetime.min.replace(tzinfo=UTC)
-
-
 @reads_recordings
 def trend(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings, with dates in their names.")],
@@ -155,7 +151,7 @@ def trend(
     from armlink.commands.plain_console import PlainConsole, results
     from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled
-    from sim_gap.trends import date_of, fleet_trends, needed_recordings, rows
+    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)
