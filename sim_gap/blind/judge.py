@@ -97,7 +97,6 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
 
 
 def _shown(label: Json, truths: Sequence[Json]) -> list[Json]:
-    """Of several effects, those that alone at least double the gap of the sound arm somewhere."""
     if label["kind"] != "several":
         return []
     falls = zip(label["effects"], label["gap"]["falls"], strict=True)
