@@ -110,17 +110,10 @@ def diagnose(
     if not heldout:
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
-        return diagnose_positions(
-            sim,
-            train,
-            heldout,
-            labels,
-            withhold=withhold,
-            checks=findings,
-            heldout_is=heldout_is,
-            gains=gains,
-            progress=progress,
+        made = diagnose_positions(
+            sim, train, heldout, labels, withhold=withhold, heldout_is=heldout_is, gains=gains, progress=progress
         )
+        return replace(made, checks=findings)
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(

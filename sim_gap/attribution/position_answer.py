@@ -10,7 +10,6 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.verdict import NEAR
-from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import LEAST_SHRINK, Stage, groups_of
 from sim_gap.position_gap.identify import Identified, identify
@@ -51,10 +50,9 @@ def diagnose_positions(
     labels: Sequence[str],
     *,
     withhold: Sequence[str],
-    checks: Sequence[RecordingFinding],
     heldout_is: str,
     progress: Callable[[str], None],
-    gains: Sequence[str] = (),
+    gains: Sequence[str],
 ) -> Diagnosis:
     """Explain the gap between commanded and measured positions; arguments as of `diagnose.diagnose`."""
     found = identify(sim, train, heldout, labels, withhold, progress, gains)
@@ -92,7 +90,6 @@ def diagnose_positions(
         heldout_is=heldout_is,
         rollout=rollout,
         notes=(*notes(found), *running_free(found, rollout, gap=verdict != "no_gap")),
-        checks=tuple(checks),
         band=found.band,
         unit="rad",
         internals=found,
