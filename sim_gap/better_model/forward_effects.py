@@ -203,7 +203,7 @@ class Effects:
         An elastic transmission or one with backlash shows in the position, whose sensor is at the motor; its
         oscillation is neglected.
         """
-        torque = self.carried(model, data) - self._pushed(model, data)
+        torque = self.carried(model, data) - self._pushed(data)
         give = self._give(torque)
         return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
@@ -216,7 +216,7 @@ class Effects:
         """Readings of the position sensors after a step [rad], (n,)."""
         return self.angle(data.qpos[self.places]) if self.rigid else self.read(model, data)[0]
 
-    def _pushed(self, model: Any, data: Any) -> Array:
+    def _pushed(self, data: Any) -> Array:
         """Torque of stops and contacts on the links, (n,)."""
         rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
         push = data.qfrc_constraint.copy()

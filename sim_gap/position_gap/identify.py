@@ -131,12 +131,13 @@ def identify(
             replay_rms(nominal(sim), some, gain)
             for some, gain in ((train, scale[: len(train)]), (heldout, scale[len(train) :]))
         )
-    search, fit, about = _fitted(search, complete, progress)
+    about = _fitted(search, complete, progress)
+    search, fit = about.search, about.fit
     progress("testing each effect on held-out data")
     margin = _margin(search, fit)
     usual, sound = sound_gap(search, judged, margin) if complete else (np.zeros(sim.n), False)
-    found = tuple(stages(search, fit, about, judged, np.maximum(margin, 2.0 * usual)))
-    before = _bare(search, fit, about, complete)
+    found = tuple(stages(about, judged, np.maximum(margin, 2.0 * usual)))
+    before = _bare(search, fit, complete)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
     left = gaps_left_out(data, terms, known_before(search, fit))
@@ -162,11 +163,11 @@ def identify(
     )
 
 
-def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
-    """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
+def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> About:
+    """The fit with the effects that it takes, and all that may be chosen about it; the nominal model as it is where it
+    leaves nothing."""
     if complete and bool(np.all(rms_on(search.data, search.nominal) < QUIET * search.floor)):
-        bare = LoopFit(search.nominal)
-        return search, bare, look_about(search, bare, [])
+        return look_about(search, LoopFit(search.nominal), [])
     search, fit = starting_fit(search, progress)
     best = select(search, fit, progress)
     left, gap = (scale_left(search, point) for point in (best.point, search.nominal))
@@ -177,7 +178,7 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
         other = select(search, limited_servo_start(search, best, unexplained), progress)
         best = max(best, other, key=lambda each: worth(search, each))
     # all candidates: what the start has explained already may have rivals that were not looked at
-    return search, best, look_about(search, best)
+    return look_about(search, best)
 
 
 def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
@@ -205,7 +206,7 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
     return [found[i] / found[0] for i in range(len(labels))]
 
 
-def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> LoopFit:
+def _bare(search: LoopSearch, fit: LoopFit, complete: bool) -> LoopFit:
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
