@@ -7,6 +7,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
+from sim_gap.attribution.verdict import NEAR
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
@@ -79,9 +80,8 @@ TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
 ALIKE = 0.5
 """Largest difference of two bodies' mass and moment, as a share of the larger, for one to be the other, turned."""
-OF_A_BODY, NEAR = 0.1, 2.0
-"""Largest share of the squares that a body leaves of a gap that is one; multiple of its margin from which a row has a
-gap."""
+OF_A_BODY = 0.1
+"""Largest share of the squares that a body leaves of a gap that is one."""
 
 
 def mounts(estimate: EffectEstimate) -> tuple[float, ...]:

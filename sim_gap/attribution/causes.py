@@ -13,7 +13,7 @@ from sim_gap.attribution.rivals import LawTest, Rivals, separating_motion
 from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import SLIGHT_NM, ResidualSet
 from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
@@ -129,9 +129,6 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
 MINOR = 0.6
 """Share of the smallest relevant gap of the rows in which it shows by which a cause must lower some joint's RMS not to
 be minor."""
-WITHIN_NM = 0.08
-"""Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
-could explain them."""
 
 
 def relevant_terms(
@@ -149,7 +146,7 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
+    absolute = heldout.least(SLIGHT_NM) if within else heldout.relevant_nm
     least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
 

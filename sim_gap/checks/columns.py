@@ -16,11 +16,8 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
-from sim_gap.checks.sound_arm import ChannelMotion, likelihood, quick_costs
+from sim_gap.checks.sound_arm import CERTAIN_COST, ChannelMotion, likelihood, quick_costs
 
-CERTAIN_FALL = 5.0 * PRICE
-"""Fall of the negative log likelihood from which a correction is certain: as rare an effect as any of the library has
-paid then, and the choice among the hundred changes that are looked at."""
 SCREENING_ROWS = 150
 """Rows that are enough to see that a hypothesis is wrong."""
 MOST_CANDIDATES = 8
@@ -132,7 +129,7 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
         before = likelihood(arm, replace(motion, reading=np.where(gone, np.nan, motion.reading))).costs
     falls = before - likelihood(arm, changed).costs
     price = 0.0 if known else PRICE * hypothesis.choices
-    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_FALL)
+    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_COST)
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:

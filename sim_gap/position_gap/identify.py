@@ -26,7 +26,7 @@ from sim_gap.position_gap.choice import (
 )
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
 from sim_gap.position_gap.plant import MovedModel, nominal_point
-from sim_gap.position_gap.sound_arm import sound_gap
+from sim_gap.position_gap.sound_arm import FRICTION_SHARE, sound_gap
 from sim_gap.position_gap.start import limited_servo_start, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
@@ -41,13 +41,10 @@ from sim_gap.position_gap.training.spread import (
 )
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, windows_of
-from sim_gap.residuals.residual_set import EXPLAINED
+from sim_gap.residuals.residual_set import EXPLAINED, SLIGHT_NM
 
 FITTED, JUDGED = 12, 24
 """Most windows of the fit, and of the judgement."""
-TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
-"""Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
-this share of the tracking error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +220,8 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
 
 
 def _margin(search: LoopSearch, fit: LoopFit) -> Array:
-    """RMS from which it is a gap, per joint (J,) [rad]."""
-    torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
-    matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)
+    """RMS from which it is a gap, per joint (J,) [rad]: torque that matters, at most a share of the joint's, over the
+    gain, at most that share of the tracking error."""
+    torque = np.minimum(SLIGHT_NM, FRICTION_SHARE * search.scales.torque)
+    matters = np.minimum(torque / fit.point["kp"], FRICTION_SHARE * search.scales.angle)
     return np.asarray(np.maximum(2.0 * search.floor, matters))

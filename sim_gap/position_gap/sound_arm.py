@@ -1,8 +1,8 @@
 """Whether a gap is one that a sound arm may have: that of a model whose parameters are known as well as they can be.
 
-Gains, damping, friction, inertia, mass moments and the time of the command of the nominal model are off by a little
-each, with a known standard deviation. Their most probable values given the training recordings say what such errors
-make of the gap; what they leave, and how improbable they are, says whether there is more to it.
+Gains, damping, friction, inertia, mass moments (NOMINAL) and the time of the command of the nominal model are off by a
+little each, with a known standard deviation. Their most probable values given the training recordings say what such
+errors make of the gap; what they leave, and how improbable they are, says whether there is more to it.
 """
 
 from collections.abc import Mapping
@@ -14,10 +14,8 @@ from scipy.stats import chi2
 from gcomp.arrays import Array
 from sim_gap.position_gap.fit import Layout, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.windows import Windows
+from sim_gap.search.estimate import NOMINAL
 
-ERROR = 0.01
-"""Relative standard deviation of gains, damping, friction, inertia and mass moments: as much as is known of a good arm,
-and as much as two arms of one build differ."""
 FRICTION_NM, FRICTION_SHARE = 0.02, 0.15
 """Standard deviation of Coulomb friction that models leave out, of bearings and seals [N·m]; at most this share of the
 joint's torque."""
@@ -40,16 +38,16 @@ def errors_of(search: LoopSearch) -> dict[Place, float]:
     """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
     nominal, scales, omitted = search.nominal, search.scales, omitted_of(search)
     deviation = {
-        "viscous": ERROR * nominal["viscous"],
-        "coulomb": np.hypot(ERROR * nominal["coulomb"], omitted["coulomb"]),
-        "armature": ERROR * scales.inertia,
+        "viscous": NOMINAL * nominal["viscous"],
+        "coulomb": np.hypot(NOMINAL * nominal["coulomb"], omitted["coulomb"]),
+        "armature": NOMINAL * scales.inertia,
         "delay": omitted["delay"],
     }
     out: dict[Place, float] = {}
     for j in range(search.data.joints):
-        out[j, "kp"] = ERROR
+        out[j, "kp"] = NOMINAL
         out |= {(j, name): float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}
-    moments = ERROR * np.linalg.norm(search.arm.inertial[:, 1:4], axis=1)
+    moments = NOMINAL * np.linalg.norm(search.arm.inertial[:, 1:4], axis=1)
     return out | {(-1, f"moment{link}.{axis}"): size for link, size in enumerate(moments.tolist()) for axis in "xyz"}
 
 

@@ -11,8 +11,9 @@ Row = tuple[str, int]
 """A channel and the index of a joint: one residual over time."""
 Columns = dict[Row, Array]
 """Columns of a linear term at each row that it touches, one per coefficient, (K, p)."""
-DOUBTED, DOUBTED_INNER = 0.01, 0.003
-"""Error granted to the model, and to the friction between motor and sensor, as a share of a joint's torque."""
+FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
+"""Error granted to every arm, and so a residual that is not worth a parameter: share of a joint's torque (RMS) against
+the model, and of motor against sensor or command; and in any case [N·m]."""
 QUIETER = 0.5
 """A noisy motor estimate is passed over if the next reference has less than this share of its uncertainty."""
 
@@ -98,9 +99,9 @@ def layout_of(signals: list[PreparedSignals]) -> ChannelLayout:
     if command is None:
         return ChannelLayout(n, sensor, motor)
     torque = np.sqrt(np.mean([np.mean(s.model**2, axis=0) for s in signals], axis=0))
-    doubts = [_noise(signals, "tau_motor"), DOUBTED * torque]
+    doubts = [_noise(signals, "tau_motor"), FLOOR * torque]
     if sensor:
-        doubts.insert(1, np.hypot(_noise(signals, sensor), DOUBTED_INNER * torque))
+        doubts.insert(1, np.hypot(_noise(signals, sensor), FLOOR_INNER * torque))
     doubt = np.array(doubts)
     best = np.argmin(doubt, axis=0)
     clear = doubt[best, np.arange(n)] < QUIETER * doubt[0]

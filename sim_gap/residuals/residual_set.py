@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from gcomp.arrays import Array, Mask
-from sim_gap.residuals.layout import ChannelLayout, Row, layout_of
+from sim_gap.residuals.layout import FLOOR, FLOOR_INNER, FLOOR_NM, ChannelLayout, Row, layout_of
 from sim_gap.residuals.preprocess import PreparedSignals
 
 BEFORE_S, AFTER_S = 0.4, 0.6
@@ -45,9 +45,8 @@ def near_impacts(s: PreparedSignals, channel: str, residual: Array) -> dict[int,
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error granted to every model, as a share of its torque."""
-FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
-"""Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, and of motor against
-sensor or command; and in any case [N·m]."""
+SLIGHT_NM = 0.08
+"""Torque that noise and the small friction of every arm can explain [N·m]."""
 RELEVANT_NM = 0.05
 """Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset."""
 SMALL_ARM_NM = 3.0

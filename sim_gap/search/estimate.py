@@ -16,8 +16,8 @@ from sim_gap.search.term import Term, shares_a_factor
 from sim_gap.search.term_equations import TermEquations
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
-"""Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
-at a link, up to WORST."""
+"""Undetected error of a nominal model, as of mass moments, relative: NOMINAL, by which two arms of one build differ, or
+WORSE times the largest error found at a link, up to WORST."""
 SHAPE_STEP = 1e-2
 """Step of the differences in a shape, as a share of it; accuracy to which it is found between its neighbours."""
 LEAST_LEVER_M = 0.01

@@ -19,6 +19,7 @@ from sim_gap.position_gap.training.spread import (
     jackknifed,
     terms_of,
 )
+from sim_gap.search.estimate import NOMINAL
 
 FRICTION = 0.15, 0.35
 
@@ -157,7 +158,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     assert [name for j, name in found.names if j < 0] == list(names)
     own = float(np.linalg.norm(search.data.plant.sim.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
-    assert np.sqrt(found.matrix[at, at]) > 0.9 * sound_arm.ERROR * own
+    assert np.sqrt(found.matrix[at, at]) > 0.9 * NOMINAL * own
 
 
 def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several) -> None:
