@@ -220,5 +220,5 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
         return
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
-        worst_sweep = f"the worst sweep is {worst.sweep}, with {worst.ratio:.1f} times its expected error"
-        console.print(f"cross-validation: {worst_sweep}")
+        off = f"the worst, {worst.sweep}, is off by {worst.ratio:.1f} times the expected error (about 1 is normal)"
+        console.print(f"cross-validation, each sweep predicted by a fit of the others: {off}")

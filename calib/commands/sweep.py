@@ -173,10 +173,10 @@ def _plan(
         planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
         took, checked = float(reading_seconds(arm_file, planned).sum()), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
-        told = f"about {_minutes(took)} for a pass"
+        told = f"about {_minutes(took)} for the pass {_load(reference_mass)}"
         if check_stops:
             told += (
-                f", {_minutes(stops_seconds(arm_file))} more before the first pass, to push every joint onto its stops"
+                f", {_minutes(stops_seconds(arm_file))} more before it, to push every joint onto its stops"
             )
         told += f"; {checked}{drawn}"
         if not reference_mass:

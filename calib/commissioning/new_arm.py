@@ -163,7 +163,7 @@ def new_arm(
         draft.notes.append(
             f"tip assumed: the model has {len(chains)} arms; choose another arm by its last body, {others} (--tip)"
         )
-    draft.name = name or draft.name
+    draft.name = name or out.stem
     made = NewArm(out, draft)
     for found in model_errors(made.parsed()):
         raise BadInput(str(found))

@@ -36,6 +36,16 @@ NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
 """Values of position sensors that were not fitted."""
 
 
+def interval_text(value: float, half: float) -> str:
+    """A value ± half of its 95 % interval; alone where that is 0."""
+    if not np.isfinite(value):
+        return "not observable"
+    if not 0 < half < np.inf:
+        return f"{value:.4f}"
+    places = max(4, -int(np.floor(np.log10(half))))  # an interval is never "± 0.0000"
+    return f"{value:.{places}f}\u00a0±\u00a0{half:.{places}f}"
+
+
 def rms(values: Array) -> Array:
     """RMS of each joint's values (K, n) that are numbers (n,)."""
     count = np.isfinite(values).sum(axis=0)

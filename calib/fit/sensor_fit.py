@@ -16,7 +16,7 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
-from calib.fit.calibration import FitFinding, FittedCalibration, rms
+from calib.fit.calibration import FitFinding, FittedCalibration, interval_text, rms
 from calib.fit.examination import Goodness, examine
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, Discrepancy, Parameter
@@ -181,8 +181,12 @@ class SensorFit(FittedCalibration):
         point, half = self.attachment
         if np.isnan(point).all():
             return "the place of the reference mass is not observable"
-        place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
-        moments = [f"{_triple(mass * point)} kg·m with {mass:g} kg" for mass in self.rows.masses if mass]
+        place = ", ".join(map(interval_text, point, half))
+        moments = [
+            f"({', '.join(interval_text(each, 0.0) for each in mass * point)}) kg·m with {mass:g} kg"
+            for mass in self.rows.masses
+            if mass
+        ]
         return (
             f"the reference mass hung at ({place}) m in the frame of the last joint; its mass moment was "
             f"{'; '.join(moments)}"
@@ -258,14 +262,6 @@ def _gain_ratio(arm_file: ArmFile, rows: SweepReadings) -> Array:
     fit = _fit(arm_file, rows, gain=Prior(1.0, std)).refined.fit
     ratio: Array = fit.values.gain
     return np.where(fit.std.gain < 0.2, ratio, np.nan)
-
-
-def _triple(values: Array) -> str:
-    return f"({', '.join(map(_value_text, values))})"
-
-
-def _value_text(value: float, interval: str = "") -> str:
-    return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
 
 
 WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from calib.fit.calibration import FittedCalibration
+from calib.fit.calibration import FittedCalibration, interval_text
 from calib.fit.creep_fit import CreepFit
 
 SENSOR_HEADINGS = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
@@ -37,16 +35,6 @@ def columns_of(fit: FittedCalibration) -> dict[str, tuple[Any, Any]]:
     """Heading → (value, half of its 95 % interval), (n,) each, of what people want to know of a calibration."""
     headings = CREEP_HEADINGS if isinstance(fit, CreepFit) else SENSOR_HEADINGS
     return {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
-
-
-def interval_text(value: float, half: float) -> str:
-    """A value ± half of its 95 % interval; alone where that is 0."""
-    if not np.isfinite(value):
-        return "not observable"
-    if not 0 < half < np.inf:
-        return f"{value:.4f}"
-    places = max(4, -int(np.floor(np.log10(half))))  # an interval is never "± 0.0000"
-    return f"{value:.{places}f}\u00a0±\u00a0{half:.{places}f}"
 
 
 def interval_table(names: Sequence[str], columns: Mapping[str, tuple[Any, Any]], caption: str = "") -> ReportTable:

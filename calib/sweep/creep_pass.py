@@ -41,7 +41,7 @@ class CreepPass(SweepPass):
             self.keep(plan)
         self._home, self._contacts = np.array(plan.scout[0]), 0
         self._made = {reading.sweep for reading in self.data.readings}
-        self._made_before, self.expected = len(self._made), creep_seconds(plan)
+        self.expected = creep_seconds(plan)
         return plan
 
     def sweep(self, sweep: Sweep) -> None:
@@ -61,7 +61,7 @@ class CreepPass(SweepPass):
             self.writer.append(reading)
         self._made.add(sweep.name)
         up = [float(each.torque[sweep.joint]) for each in readings if each.direction.sum() > 0]
-        self.tell(len(self._made), self._made_before, sweep.name, up)
+        self.tell(len(self._made), sweep.name, up)
 
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
         mover, joint = self.mover, sweep.joint

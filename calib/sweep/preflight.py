@@ -5,6 +5,7 @@ A drive that gets too hot later says so by an emergency, which ends any sweep.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
+from calib.plan.planned_arm import PlannedArm
 from gcomp.arrays import Array, Mask
 
 LISTEN = 0.5
@@ -134,19 +136,26 @@ def find_stops(
     """Push each joint slowly onto both its stops, no harder than its position loop does 15 mrad off, others mid-range.
 
     Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
-    does not get to is left out.
+    does not get to, or on whose way bodies of the model touch, is left out.
     """
-    limits, section = DriveLimits.of(arm), sweep_section(arm)
-    mover = Mover(link, section, limits)
+    limits, planned = DriveLimits.of(arm), PlannedArm(arm)
+    mover = Mover(link, planned.section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2
     stops = np.full((link.n, 2), np.nan)
     for count, joint in enumerate(reversed(range(link.n))):
         for end, side in enumerate((-1, 1)):
-            goal = middle.copy()
+            goal, here = middle.copy(), mover.command.position.copy()
             goal[joint] = mover.before_stop(joint, side, STOP_SEARCH_DISTANCE)
+            at_stop = goal.copy()
+            at_stop[joint] = limits.lower[joint] if side < 0 else limits.upper[joint]
+            ways = ([here, goal, at_stop], [here, middle, goal, at_stop])
+            way = next((each for each in ways if all(planned.is_clear(*leg) for leg in pairwise(each))), None)
+            if way is None:
+                continue
             try:
-                mover.travel(goal, 1.0)
+                for pose in way[1:-1]:
+                    mover.travel(pose, 1.0)
                 push = np.zeros(link.n, dtype=np.int64)
                 push[joint] = side
                 stops[joint, end] = mover.touch(push)[joint]
@@ -157,7 +166,8 @@ def find_stops(
                 mover.travel(middle, 1.0)
             if report is not None:
                 report(2 * count + end + 1, 2 * link.n)
-    mover.travel(middle, 1.0)
+    if planned.is_clear(mover.command.position, middle):
+        mover.travel(middle, 1.0)
     return replace(found, stops=stops)
 
 

@@ -80,7 +80,7 @@ class StepPass(SweepPass):
         self.readings.append(reading)
         joint, name = reading.joint, reading_name(reading.sweep, reading.index)
         curve = [] if joint is None else [each.torque[joint] for each in self.readings if each.sweep == reading.sweep]
-        self.tell(len(self.readings), len(self.data.readings), name, curve)
+        self.tell(len(self.readings), name, curve)
 
     def _scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""

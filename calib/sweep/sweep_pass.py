@@ -61,8 +61,8 @@ def repeat_work(
 Progress = Callable[[int, int, float, str], None]
 """Called with (readings or sweeps done, how many in all, seconds left, what is being done)."""
 
-TRUST = 30.0
-"""The plan counts for as much as so long a time of the pass itself [s]: its first ways are no sample of the rest."""
+TRUST = 5.0
+"""The plan counts for as much as so long a time of the pass itself [s]."""
 BARS = "▁▂▃▄▅▆▇█"
 
 
@@ -81,7 +81,9 @@ class SweepPass(ABC):
         """`data` is what the writer's directory has so far."""
         self.arm, self.mover, self.writer, self.data = arm, mover, writer, data
         self.progress: Progress = progress or (lambda *_: None)
-        self._began, self._on_stall = time.monotonic(), on_stall
+        self._on_stall = on_stall
+        self._first: tuple[int, float] | None = None
+        """How much was done when it was told first, and when that was [s]."""
         self.expected = np.zeros(0)
         """By the plan [s], of each of what `tell` counts."""
 
@@ -114,10 +116,11 @@ class SweepPass(ABC):
         restart(self.mover.link, self._on_stall, stall, note)
         repeat_work(self.mover.link, self._on_stall, self.mover.resume)
 
-    def tell(self, done: int, before: int, name: str, curve: Sequence[float]) -> None:
-        """Report what is done, `before` of it by an earlier run; with a plot of the torques of the sweep under way."""
-        took, was_expected = time.monotonic() - self._began, float(self.expected[before:done].sum())
-        left = float(self.expected[done:].sum()) * (took + TRUST) / (was_expected + TRUST)
+    def tell(self, done: int, name: str, curve: Sequence[float]) -> None:
+        """Report what is done; with a plot of the torques of the sweep under way."""
+        first, began = self._first = self._first or (done, time.monotonic())
+        pace = (time.monotonic() - began + TRUST) / (float(self.expected[first:done].sum()) + TRUST)
+        left = float(self.expected[done:].sum()) * pace
         self.progress(done, len(self.expected), left, f"{name} {sparkline(curve)}" if curve else name)
 
 

@@ -96,8 +96,10 @@ def sim(
         )
         server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_command = lambda answer: console.print(f"sim: {answer}")
+        deadline = described.require_link().deadline
         server.on_late = lambda lag, at: console.print(
-            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s, so a host may report silent drives"
+            f"sim: at {at:.1f} s this process was {1000 * lag:.0f} ms late, and so were its readings (from "
+            f"{1000 * deadline:.0f} ms on a host reports silent drives)"
         )
         return server.run()
     finally:

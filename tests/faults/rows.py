@@ -197,7 +197,7 @@ ROWS = (
         "wall clock",
         "the host's wall clock is set back by an hour",
         "set the wall clock",
-        "it is not a fault: the link uses the monotonic clock",
+        "not a fault: the link uses the monotonic clock",
         None,
         "continue",
         "nothing",
@@ -227,7 +227,7 @@ ROWS = (
 def table() -> str:
     """The table as docs/faults.md has it."""
     lines = [
-        "| fault | how it is injected | how it is detected | detected within | what the joints do | the user reads |",
+        "| fault | injected by | detected by | detected within | reaction of the joints | the user reads |",
         "|---|---|---|---|---|---|",
     ]
     for row in ROWS:

@@ -58,7 +58,7 @@ def new(
             rich_help_panel="Model",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the arm; by default the name of the model.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the arm; by default the name of the arm file.")] = None,
     bus: Annotated[
         str | None,
         typer.Option(
@@ -144,7 +144,7 @@ def new(
         return rewire(found, out, str(bus), ask, by_ids=by_ids, bundled=bundled is not None, json=json_file)
     if bus is not None:
         open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
-    with console.status(f"reading {model} and looking for collisions"):
+    with console.status(f"reading {model.name} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(
             model,

@@ -155,6 +155,19 @@ def test_a_joint_that_strikes_its_stop_and_turns_round_is_not_contradicted() -> 
         assert not watch.contradicted[0]
 
 
+@pytest.mark.parametrize(("rate", "contradicted"), [(250.0, True), (50.0, False)])
+def test_a_joint_that_swings_in_time_with_slow_cycles_is_not_contradicted(rate: float, contradicted: bool) -> None:
+    """Each velocity meets the same phase of the swing, which is that of a drive between two targets; at 250 Hz a drive
+    cannot swing so fast."""
+    watch, found = MotionWatch(1, 1 / rate), False
+    watch.use(np.array([1e-4]), np.array([1.0]))
+    for cycle in range(round(4 * rate)):
+        t = cycle / rate
+        watch.update([0.01 * t], [t], [t], [-0.13], [t])
+        found = found or watch.contradicted[0]
+    assert found == contradicted
+
+
 def test_answers_to_other_requests_do_not_make_readings_that_catch_up_a_second_node():
     bus = BusWatch(1)
 

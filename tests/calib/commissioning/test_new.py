@@ -20,7 +20,9 @@ from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.drive_match import arm_of_bus
 from calib.commissioning.new_arm import NewArm, new_arm
-from calib.plan.collisions import Geometry
+from calib.plan.collisions import Geometry, check_plan
+from calib.plan.rough_gravity import guess_of_file
+from calib.plan.sweep_plan import plan_sweep
 from gcomp.errors import BadModel
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -72,9 +74,21 @@ def test_a_joint_without_stops_is_not_pressed_on_any(made, tmp_path):
     assert gcomp_arm(given.parsed()).upper[3] == 1.0
 
 
-def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_touches(tmp_path):
+def test_prismatic_fingers_are_set_aside_and_a_range_that_a_plan_keeps_clear_stays_whole(tmp_path):
     made = new_arm(MODELS / "own.xml", tmp_path / "own.yaml")
     assert [joint.name for joint in made.draft.joints] == ["yaw", "pitch", "elbow", "roll"]
+    assert all(joint.stops is None for joint in made.draft.joints)
+    made.write()
+    arm = load_arm(made.out)
+    for seed in range(2):
+        check_plan(arm, plan_sweep(arm, guess_of_file(arm), seed=seed))
+
+
+def test_a_range_is_chosen_where_nothing_touches(tmp_path):
+    """With its shoulder 20 cm above the ground the arm cannot be swept over its whole range."""
+    low = tmp_path / "low.xml"
+    low.write_text((MODELS / "own.xml").read_text().replace('pos="0 0 0.3"', 'pos="0 0 0.2"'))
+    made = new_arm(low, tmp_path / "low.yaml")
     made.write()
     marked = [each for each in comments(made.out) if each.startswith("stops assumed")]
     assert len(marked) == sum(joint.stops is not None for joint in made.draft.joints) == 4

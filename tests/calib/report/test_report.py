@@ -11,6 +11,7 @@ from synthetic_sweeps import passes
 
 from armlink.errors import Refused
 from calib.dataset import SweepData
+from calib.fit.calibration import interval_text
 from calib.fit.field_fit import fit_field, held_out_rows
 from calib.fit.gravity_fit import held_out_steps, heldout_scores, identify_gravity
 from calib.fit.recorded_rows import rows_of_sweeps
@@ -22,7 +23,6 @@ from calib.records.records import CalibrationRecord, JointCalibration
 from calib.records.store import RecordStore
 from calib.report.calibration import Calibrated, write_report
 from calib.report.figures import sweep_rows, sweeps_of
-from calib.report.tables import interval_text
 
 ARM = random_arm(1, 3)
 TRUTH, DATA = passes(ARM, 1)

@@ -3,19 +3,22 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bench_arm import bench, post
 from hard_cases import stick
 from sweep_arms import random_arm
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, load_arm
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
 from calib.motion.encoder_check import EncoderFault
+from calib.plan.collisions import Geometry
 from calib.plan.drawing import stops_seconds
 from calib.sweep.preflight import HOT, find_stops, listen
 from sim_bus.bus.lock_step import LockStepBus
@@ -135,6 +138,24 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
         assert simulated.time - begun == pytest.approx(stops_seconds(ARM), rel=0.25)
         with pytest.raises(Refused, match=r"j2 was blocked at .* its stop should be at"):
             find_stops(link, wider, listened)
+
+
+def test_a_stop_on_whose_way_bodies_touch_is_left_out(tmp_path: Path) -> None:
+    """The arm, stretched out, meets the post on the shoulder's way up."""
+    (tmp_path / "simulated.yaml").write_text(f"{Path(bench(tmp_path, post(0.3, 0.3)).path).read_text()}sim: {{}}")
+    arm = load_arm(str(tmp_path / "simulated.yaml"))
+    geometry, commanded = Geometry(arm), list[np.ndarray]()
+    with enabled(SimulatedArm(arm, Truth.of(arm), 1), arm) as link:
+        listened, whole = listen(link, arm), link.cycle
+
+        def noted(command: Any) -> Any:
+            commanded.append(command.position.copy())
+            return whole(command)
+
+        link.cycle = noted  # type: ignore[method-assign]
+        found = find_stops(link, arm, listened)
+    np.testing.assert_allclose(found.stops, [[np.nan, 1.2], [-1.5, 1.5]], atol=0.01)
+    assert geometry.free(np.array(commanded)[::20]).all()
 
 
 def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
