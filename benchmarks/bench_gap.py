@@ -18,9 +18,8 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model, read_spec
 from sim_gap.residuals.layout import layout_of
-from sim_gap.residuals.location import by_joint, row_rms
 from sim_gap.residuals.preprocess import prepare
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import ResidualSet, by_joint, row_rms
 
 ARM = "sarcos"
 SECONDS, RATE = 30.0, 250.0

@@ -78,7 +78,7 @@ def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: 
         for number in chosen:
             shape.turn(number, shape.low + share * (shape.high - shape.low))
     shape.sines(chosen, random)
-    return shape.motion()
+    return PlannedMotion(shape.names, shape.rate, np.concatenate(shape.rows), tuple(shape.pieces))
 
 
 class _Shape:
@@ -126,9 +126,6 @@ class _Shape:
         self.rows.append(rows)
         self.here = rows[-1]
         self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
-
-    def motion(self) -> PlannedMotion:
-        return PlannedMotion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
 
 
 def multisine(t: Array, reach: Array, speed: Array, band: tuple[float, float], draw: Array) -> Array:

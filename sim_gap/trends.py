@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.answer import Internals
+from sim_gap.attribution.diagnose import Internals
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.effects.registry import effects
 from sim_gap.search.estimate import EffectEstimate
@@ -83,6 +83,7 @@ below, it may be reported on one day and not on the next."""
 FOUND = 0.6
 """Share of a window's diagnoses that must have the parameter; it counts as zero if fewer than the rest have it."""
 DATE = re.compile(r"(\d{4})-?(\d\d)-?(\d\d)(?:[T_-]?(\d\d):?(\d\d))?")
+UNDATED = datetime.min.replace(tzinfo=UTC)
 
 Key = tuple[str, str, str, str]
 """Arm, effect, joint, parameter."""
@@ -201,7 +202,7 @@ def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dic
     }
     for case, answer in sorted(answers.items()):
         if "error" not in answer:
-            by_arm[case.split("/")[0]].append((date_of(case) or datetime.min.replace(tzinfo=UTC), answer))
+            by_arm[case.split("/")[0]].append((date_of(case) or UNDATED, answer))
     out: dict[Key, _Series] = {}
     for arm, cases in by_arm.items():
         if dated and (arm in undated or len(cases) < NEEDED):

@@ -7,6 +7,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
+from sim_gap.attribution.verdict import NEAR
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
@@ -46,19 +47,16 @@ def body_of(estimate: EffectEstimate) -> Term | None:
 
 
 def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
-    """The held-out recordings, each numbered by whether it was made with the body that training recordings have.
-
-    By its groups if there are any; else by the sum of squares that remains with and without the body. If it is mounted
-    in another way, turned about the last joint's axis, by which angle. A recording that is a part of a training
-    recording stays as it is.
+    """The held-out recordings, each numbered by whether it was made with the body that training recordings have, and
+    with the angle by which that is turned about the last joint's axis.
     """
     body = body_of(estimate)
     train = estimate.store.data.signals
     known = {s.number: s for s in train}
     if body is None or all(s.number in known for s in heldout.signals):
         return heldout
-    with_it = next(s for s in train if body.form.signature.present(body.shape, s.number))
-    others = [s.groups for s in train if body.form.signature.present(body.shape, s.number)]
+    with_it = next(s for s in train if body.present(s.number))
+    others = [s.groups for s in train if body.present(s.number)]
     out = []
     for s in heldout.signals:
         if s.number in known:
@@ -82,16 +80,15 @@ TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
 ALIKE = 0.5
 """Largest difference of two bodies' mass and moment, as a share of the larger, for one to be the other, turned."""
-OF_A_BODY, NEAR = 0.1, 2.0
-"""Largest share of the squares that a body leaves of a gap that is one; multiple of its margin from which a row has a
-gap."""
+OF_A_BODY = 0.1
+"""Largest share of the squares that a body leaves of a gap that is one."""
 
 
 def mounts(estimate: EffectEstimate) -> tuple[float, ...]:
     """Angle by which the body is turned in each training recording against the first that has it [rad]."""
     body, data = body_of(estimate), estimate.store.data
     angles = [s.mount for s in data.signals]
-    have = [k for k, s in enumerate(data.signals) if body and body.form.signature.present(body.shape, s.number)]
+    have = [k for k, s in enumerate(data.signals) if body and body.present(s.number)]
     owns = [_own(estimate, estimate.store, body, k)[0] for k in have] if body and len(have) > 1 else []
     for k, own in zip(have, owns, strict=False):
         angle = _turn(data.signals[k], owns[0], own)
@@ -121,10 +118,7 @@ def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: in
 
 
 def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
-    """Angle about the last joint's axis from a body (mass, moment) to another one; zero if they are different bodies.
-
-    They are alike if their masses are, and the sizes of their moments across the axis.
-    """
+    """Angle about the last joint's axis from a body (mass, moment) to another; zero if they are different bodies."""
     axis = s.arm.axis[-1]
     across = [body[1:] - (body[1:] @ axis) * axis for body in (one, other)]
     sizes = [np.array([abs(b[0]), np.linalg.norm(r)]) for b, r in zip((one, other), across, strict=True)]
@@ -146,7 +140,7 @@ def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet)
         others = [(k, s) for k, s in enumerate(heldout.signals) if s.number not in known]
         owns = {k: _own(estimate, estimate.on(ResidualSet((s,), heldout.layout)), trial, 0) for k, s in others}
         return [k for k, (_, left) in owns.items() if left < OF_A_BODY]
-    if not all(body.form.signature.present(body.shape, number) for number in known):
+    if not all(body.present(number) for number in known):
         return []
     return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]
 
@@ -164,7 +158,5 @@ def _left(estimate: EffectEstimate, data: ResidualSet) -> float:
 
 def recordings_with(term: Term, sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     """Labels of the recordings that have a term; empty if all of them do."""
-    every = list(
-        dict.fromkeys((s.label, term.form.signature.present(term.shape, s.number)) for d in sets for s in d.signals)
-    )
+    every = list(dict.fromkeys((s.label, term.present(s.number)) for d in sets for s in d.signals))
     return () if all(present for _, present in every) else tuple(label for label, present in every if present)

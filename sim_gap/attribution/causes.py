@@ -9,11 +9,11 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs
-from sim_gap.attribution.rivals import LawTest, Rivals
+from sim_gap.attribution.rivals import LawTest, Rivals, separating_motion
 from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import SLIGHT_NM, ResidualSet
 from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
@@ -72,11 +72,8 @@ class _Scorer:
         return self._by_joint(self.squares(terms))
 
     def falls(self, terms: Sequence[Term], more: Sequence[Term], by_row: bool) -> Array:
-        """Decrease of each joint's RMS by `more` in addition to `terms`, (n,).
-
-        `by_row`, and at a joint whose command passes over noisy channels: the largest decrease of one row, noise
-        subtracted.
-        """
+        """Decrease of each joint's RMS by `more` in addition to `terms`, (n,); `by_row`, and at a joint whose command
+        passes over noisy channels, the largest of one row, noise subtracted."""
         layout = self.heldout.layout
         before, after = (self.squares([*chosen]) for chosen in (terms, [*terms, *more]))
         whole = self._by_joint(before) - self._by_joint(after)
@@ -132,9 +129,6 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
 MINOR = 0.6
 """Share of the smallest relevant gap of the rows in which it shows by which a cause must lower some joint's RMS not to
 be minor."""
-WITHIN_NM = 0.08
-"""Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
-could explain them."""
 
 
 def relevant_terms(
@@ -152,7 +146,7 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
+    absolute = heldout.least(SLIGHT_NM) if within else heldout.relevant_nm
     least = np.maximum(MINOR * max(map(heldout.relevant, shows)) * heldout.usual_torque, absolute)
     by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
 
@@ -207,8 +201,7 @@ def causes(
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
-    """Whether some held-out recording has a term."""
-    return any(term.form.signature.present(term.shape, s.number) for s in heldout.signals)
+    return any(term.present(s.number) for s in heldout.signals)
 
 
 def _cause(
@@ -219,9 +212,9 @@ def _cause(
     places = sorted({term.place for term in terms})
     whole = effects()[step.effect].signature.whole_arm
     touched = np.arange(len(names)) if whole else np.array(places)
-    weighed = rivals.weigh(step.effect, terms)
-    stand_in = law_test.best_law(terms)
-    signs = scorer.signs(terms, weighed.evidence, stand_in.worse)
+    evidence, confounded = rivals.weigh(step.effect, terms)
+    outside, law = law_test.best_law(terms)
+    signs = scorer.signs(terms, evidence, outside)
     parameters: dict[str, dict[str, Value]] = {}
     for term in sorted(terms, key=lambda t: t.place):
         parameters.setdefault("arm" if whole else names[term.place], {}).update(scorer.estimate.parameters(term))
@@ -231,12 +224,12 @@ def _cause(
         parameters=parameters,
         gap_before=float(np.sqrt(np.mean(step.before[touched] ** 2))),
         gap_after=float(np.sqrt(np.mean(step.after[touched] ** 2))),
-        confidence=confidence(signs, len(weighed.confounded_with)),
+        confidence=confidence(signs, len(confounded)),
         fall=step.fall,
         signs=signs,
-        confounded_with=weighed.confounded_with,
-        separate_by=weighed.separate_by,
-        law=stand_in.law,
+        confounded_with=confounded,
+        separate_by=separating_motion(step.effect, confounded),
+        law=law,
     )
 
 

@@ -1,13 +1,7 @@
-"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out.
-
-In order: the model (`sim_gap.model`), the check of joints, units and clocks (`sim_gap.checks`), prepared recordings and
-residuals (`sim_gap.residuals`), selection and fit of effects (`sim_gap.search`), causes, and the answer with verdict
-(this package). `armlink gap diagnose` (`sim_gap.commands.gap_diagnose`) reads the files, calls `diagnose` and shows its
-result.
-"""
+"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +10,7 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
-from sim_gap.attribution.answer import Internals, answer
+from gcomp.arrays import Array
 from sim_gap.attribution.bodies import (
     body_of,
     groups_of,
@@ -24,26 +18,29 @@ from sim_gap.attribution.bodies import (
     numbered_by_body,
     recordings_with_another_body,
 )
-from sim_gap.attribution.causes import causes
-from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.attribution.causes import causes, remainder
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 from sim_gap.attribution.friction_compensation import find_compensations, held_in_commands
+from sim_gap.attribution.notes import aside_notes, law_notes, notes, worse_notes
 from sim_gap.attribution.position_answer import diagnose_positions
+from sim_gap.attribution.residual_laws import as_effects, residual_laws
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.attribution.verdict import is_within
+from sim_gap.attribution.rollout import roll_out
+from sim_gap.attribution.verdict import is_within, share_left, verdict
 from sim_gap.checks.check import (
     check_position_only,
     check_recordings,
     is_position_only,
+    match_joints,
     times_in_motion,
     unchecked_note,
 )
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
 from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
-from sim_gap.residuals.disregarded_rows import without_disturbances
+from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps, without_disturbances
 from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
-from sim_gap.residuals.residual_set import ResidualSet, residual_sets
+from sim_gap.residuals.residual_set import ResidualSet, by_joint, locate, residual_sets, row_rms
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import AGAIN, ROUNDS, select_model
@@ -53,6 +50,21 @@ OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 LENT = "the first half was used for the fit, since no training recording has the same load at the tip"
 """Why half of a held-out recording is fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Internals:
+    """Model, data and fit behind a diagnosis, for report, roll-out and export."""
+
+    model: SimModel
+    train: ResidualSet
+    heldout: ResidualSet
+    estimate: EffectEstimate
+    """Without a term if there is no gap."""
+    recordings: tuple[Recording, ...]
+    """Held-out recordings."""
+    fitted: EffectEstimate
+    """The fit even if there is no gap."""
 
 
 def diagnose(
@@ -70,12 +82,9 @@ def diagnose(
     tip: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Diagnosis:
-    """Explain the gap between a simulation model and recordings of the real arm.
+    """Explain the gap between a simulation model and recordings of the real arm, as `sim_gap.api.diagnose`.
 
     Args:
-        model: path of an MJCF, URDF or arm file, or a compiled `mujoco.MjModel`; the nominal arm.
-        train: recordings to fit.
-        heldout: recordings to judge on, not used in the fit; without any, the end of each training recording is.
         labels: names of the recordings for messages, train first.
         groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
@@ -83,8 +92,6 @@ def diagnose(
             into none of them again.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
         known_gains: those of the position controllers, where the model lacks them; only without torque.
-        base: body of the model that carries the recorded arm; by default the world, or that of the arm file.
-        tip: body of the model that the recorded arm ends in, where it has several arms.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
     Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`positions`).
@@ -103,17 +110,10 @@ def diagnose(
     if not heldout:
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
-        return diagnose_positions(
-            sim,
-            train,
-            heldout,
-            labels,
-            withhold=withhold,
-            checks=findings,
-            heldout_is=heldout_is,
-            gains=gains,
-            progress=progress,
+        made = diagnose_positions(
+            sim, train, heldout, labels, withhold=withhold, heldout_is=heldout_is, gains=gains, progress=progress
         )
+        return replace(made, checks=findings)
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(
@@ -137,13 +137,67 @@ def diagnose(
     within = not fit.impacts and is_within(judge) and is_within(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, within=within)
     shown, minor = (estimate, minor) if found or not within else (EffectEstimate(estimate.store, ()), [])
-    made = answer(Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor, heldout_is)
+    made = _answer(Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor, heldout_is)
     compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))
     made = replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
     settled = not made.doubts or made.verdict == "unexplained"
     return made if settled else replace(made, verdict="ambiguous")
+
+
+def _answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
+    """The diagnosis from its causes, the minor ones, and a description of the held-out data."""
+    fit, judge, estimate = made.train, made.heldout, made.estimate
+    explained = estimate.predict(judge)
+    left, left_fit = remainder(judge, explained), remainder(fit, estimate.predict(fit))
+    stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
+    sets = [(judge, left), *([(fit, left_fit)] if found else [])]
+    friction = _dry_friction(made.model.arm.frictionloss, estimate)
+    known = [row for row in fit.rows if slides(fit, row)]
+    aside = [*slow_gaps(judge, explained, friction, known), *fast_gaps(judge, made.recordings)]
+    laws = residual_laws(fit, judge, left_fit, left, friction)
+    result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
+    if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
+        result = "unexplained"
+    hints = [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]
+    shown = hints if result == "unexplained" else found
+    levels = row_rms(judge), row_rms(judge, left), judge.margin, judge.floor
+    before, after, margin, floor = (by_joint(judge, each) for each in levels)
+    return Diagnosis(
+        verdict=result,
+        names=made.model.arm.names,
+        where=(*locate(judge), *aside),
+        left_out=share_left_out(judge),
+        causes=tuple(shown),
+        minor=tuple(minor),
+        noise_floor=floor,
+        train_before=by_joint(fit, row_rms(fit)),
+        train_after=by_joint(fit, row_rms(fit, left_fit)),
+        heldout_before=before,
+        heldout_after=after,
+        unexplained=share_left(judge, left),
+        margin=margin,
+        heldout_is=heldout_is,
+        rollout=roll_out(made.model, judge, made.recordings, estimate, found, as_effects(laws, made.model.arm.names)),
+        laws=tuple(laws),
+        notes=(
+            *notes(found, stuck, estimate, fit, judge, left),
+            *worse_notes(made.model.arm.names, before, after, margin),
+            *aside_notes(aside),
+            *law_notes(laws, made.model.arm.names),
+        ),
+        internals=made,
+    )
+
+
+def _dry_friction(nominal: Array, estimate: EffectEstimate) -> Array:
+    """Dry friction of the joints as far as it is known: the model's, and what was found beside it [N·m], (n,)."""
+    friction = nominal.copy()
+    for term in estimate.terms:
+        if term.effect == "friction.coulomb":
+            friction[term.place] += estimate.of(term)[0]
+    return np.maximum(friction, 0.0)
 
 
 def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:

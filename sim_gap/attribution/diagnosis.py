@@ -10,7 +10,7 @@ from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.position_gap.training.bands import SHARE, Band
-from sim_gap.residuals.location import Location
+from sim_gap.residuals.residual_set import Location
 from sim_gap.search.estimate import Value
 
 HINT = 0.5
@@ -124,7 +124,7 @@ class Diagnosis:
     checks: tuple[RecordingFinding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
-    """Fit and data behind the result (`answer.Internals`), for report and export."""
+    """Fit and data behind the result (`diagnose.Internals`), for report and export."""
 
     @property
     def doubts(self) -> tuple[RecordingFinding, ...]:
@@ -132,7 +132,6 @@ class Diagnosis:
         return tuple(finding for finding in self.checks if not finding.corrected)
 
     def to_json(self) -> dict[str, Any]:
-        """The dictionary of schema armlink.gap/2."""
         roll: dict[str, Any] = {"horizon_s": None, "closed_loop": False, "before": [], "after": [], "effects": []}
         if self.rollout:
             roll = _fields(self.rollout) | {"effects": [_fields(each) for each in self.rollout.effects]}

@@ -12,9 +12,8 @@ from sim_gap.attribution.rivals import AS_GOOD
 from sim_gap.effects.registry import LAWS
 from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.location import Location, locate, row_rms
 from sim_gap.residuals.preprocess import ABSENT, TRIM_S
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import Location, ResidualSet, locate, row_rms
 from sim_gap.search.estimate import NOMINAL, EffectEstimate
 from sim_gap.search.term import BODY, CONSTANT, MASSES, shares_a_factor
 

@@ -1,4 +1,4 @@
-"""The answer from recordings without a torque channel: causes, verdict and roll-out in radians."""
+"""The answer from recordings without a torque channel: causes, verdict, roll-out in radians, and notes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,26 +9,27 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
-from sim_gap.attribution.position_notes import notes, running_free
 from sim_gap.attribution.verdict import NEAR
-from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import LEAST_SHRINK, Stage, groups_of
 from sim_gap.position_gap.identify import Identified, identify
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.training.export import WRITTEN
+from sim_gap.position_gap.plant import held_parts
+from sim_gap.position_gap.start import controller_name
+from sim_gap.position_gap.training.bands import SHARE
+from sim_gap.position_gap.training.export import WRITTEN, effects_left_out, widened_joints
 from sim_gap.position_gap.training.replay import (
     EACH_S,
     LONGEST_S,
     SHORT_S,
     Simulated,
+    model_without,
     replay_rms,
     simulated_model,
-    without_groups,
 )
-from sim_gap.position_gap.training.spread import interval, payload_centre
-from sim_gap.residuals.location import Location
-from sim_gap.residuals.residual_set import EXPLAINED
+from sim_gap.position_gap.training.spread import interval, payload_centre, undecided_scale
+from sim_gap.position_gap.training.unreached_limits import describe
+from sim_gap.residuals.residual_set import EXPLAINED, Location
 from sim_gap.search.estimate import Value
 
 ALMOST = 0.75
@@ -49,10 +50,9 @@ def diagnose_positions(
     labels: Sequence[str],
     *,
     withhold: Sequence[str],
-    checks: Sequence[RecordingFinding],
     heldout_is: str,
     progress: Callable[[str], None],
-    gains: Sequence[str] = (),
+    gains: Sequence[str],
 ) -> Diagnosis:
     """Explain the gap between commanded and measured positions; arguments as of `diagnose.diagnose`."""
     found = identify(sim, train, heldout, labels, withhold, progress, gains)
@@ -90,7 +90,6 @@ def diagnose_positions(
         heldout_is=heldout_is,
         rollout=rollout,
         notes=(*notes(found), *running_free(found, rollout, gap=verdict != "no_gap")),
-        checks=tuple(checks),
         band=found.band,
         unit="rad",
         internals=found,
@@ -113,8 +112,8 @@ def _lowers(found: Identified, stage: Stage) -> bool:
 def _differs(found: Identified, stage: Stage) -> bool:
     """Whether some parameter's interval leaves out the nominal value."""
     for j, name in found.search.places_of(stage.group):
-        _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
-        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
+        own = interval(found.search, found.fit, found.within, j, name)
+        if not own.low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= own.high:
             return True
     return False
 
@@ -139,7 +138,7 @@ def _is_within(found: Identified) -> bool:
     within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
     moved = found.moved_train, found.moved_before
     within = within or all(bool(np.all(gap < found.margin)) for gap in moved)
-    return within or (found.sound is not None and found.sound.explained)
+    return within or found.sound
 
 
 def _is_small(found: Identified) -> bool:
@@ -190,14 +189,14 @@ def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
     if not joints:
         columns = [name for _, name in found.search.places_of(stage.group)]
         place = effect.partition("@")[2] or "arm"
-        values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
+        values = {c.partition(".")[2]: interval(found.search, found.fit, found.spread, -1, c) for c in columns}
         if effect == "link.payload":
-            values |= {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
+            values |= {c.partition(".")[2]: payload_centre(found.fit, found.spread, c) for c in columns[1:]}
         return {place: values}
     own = EFFECTS[effect]
     return {
         found.sim.arm.names[j]: {
-            called: Value(*interval(found.search, found.fit, found.spread, j, name))
+            called: interval(found.search, found.fit, found.spread, j, name)
             for name, called in zip(own.parameters, own.reported, strict=True)
         }
         for j in joints
@@ -233,8 +232,163 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
             continue
         others = [group for group in groups if group != stage.group]
         alone, without = (
-            gap(without_groups(found.sim, found.search, made, some), short) for some in (others, [stage.group])
+            gap(model_without(found.sim, found.search, made, some), short) for some in (others, [stage.group])
         )
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))
     return Rollout(longest, found.moved_before, after, tuple(effects), closed_loop=True)
+
+
+# ---- notes: what positions leave open, and where the exported model is further off
+
+FAR = 3.0
+"""So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
+NEAR_A_ROW = 0.2
+"""Share of the sampling period within which a time is taken for whole rows."""
+MOST_NAMED = 4
+"""Bodies that a note names."""
+AT_TIMES = 0.01
+"""Share of the held-out samples from which a note says that they are faster than any that was fitted."""
+
+
+def notes(found: Identified) -> list[str]:
+    """Notes on the controller, on limits that were not reached, and on effects that the exported model leaves out."""
+    names = found.sim.arm.names
+    kind = controller_name(found.fit) if found.search.open_controller else "position actuators as in the model"
+    out = [
+        f"there is no torque channel, so controller ({kind}) and effects are fitted to q_cmd and q, and the gap is in "
+        "rad"
+    ]
+    if loose := undecided_scale(found.fit, found.spread):
+        listed = ", ".join(names[j] for j in loose)
+        out.append(
+            f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the scale is "
+            "taken from the inertia of the model: to measure the scale, hold a known load or record the current"
+        )
+    if any("viscous" in (own := found.fit.at(j)) and "back_emf" not in own for j in range(found.sim.n)):
+        out.append(
+            "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only their sum is "
+            "given" + (", as part of the controller" if found.search.open_controller else "")
+        )
+    if found.search.resting:
+        listed = ", ".join(names[j] for j in sorted(found.search.resting))
+        assumed = (
+            "they are assumed to be held still by a controller"
+            if found.search.open_controller
+            else "the values of the model are kept"
+        )
+        out.append(f"{listed}: no training recording moves these joints, so nothing can be fitted for them: {assumed}")
+    if limits := describe(found.spread.limits, names):
+        out.append(f"the training motion does not reach these limits: {limits}")
+    out += [*_early(found), *_held(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
+    left = effects_left_out(found.search, found.fit) if found.sim.path is not None else []
+    if left:
+        applied = [f"{effect} {joint}" for effect, joint, _ in found.beside.effects] if found.beside else []
+        module = f"; a separate model with a module applies {', '.join(applied)}" if applied else ""
+        out.append(f"the corrected model leaves out: {', '.join(left)}{module}")
+    return out
+
+
+def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> list[str]:
+    """Notes of a file that is written and leaves more than the nominal model, whether there is a `gap` or not, and of
+    the joints at which it leaves much more of the gap than the fit."""
+    if rollout is None:
+        return []
+    out = []
+    if rollout.worse:
+        before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
+        out.append(
+            "in a free-running simulation, the corrected model leaves a larger gap "
+            f"({after:.3g} rad) than the nominal model ({before:.3g} rad): "
+            + ("do not train with the corrected model, and record other motion" if gap else "use the nominal model")
+        )
+    left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
+    far = [
+        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (fit {found.heldout_after[j]:.3g})"
+        for j in np.flatnonzero(left > FAR * least)
+    ]
+    told = "in a free-running simulation of the held-out motion, the corrected model leaves a larger gap than the fit"
+    return [*out, *_note(told, far)]
+
+
+def _note(told: str, where: Sequence[str], advice: str = "") -> list[str]:
+    """A note with the places that it holds for; none without a place."""
+    return [f"{told}: {', '.join(where)}" + (f": {advice}" if advice else "")] if where else []
+
+
+def _early(found: Identified) -> list[str]:
+    """A note of commands that act before their time, as those of rows with the position of a later row do."""
+    early = {}
+    for j in range(found.sim.n):
+        if "delay" not in found.fit.at(j):
+            continue
+        late = interval(found.search, found.fit, found.within, j, "delay")
+        if late.high < 0.0:
+            early[found.sim.arm.names[j]] = late.value
+    if not early:
+        return []
+    period, time = found.heldout.period, float(np.median([*early.values()]))
+    rows = round(time / period)
+    time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
+    listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
+    return [
+        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold the "
+        f"position of a later time, or two clocks differ; correct the time with --clock q_cmd={time:.3g}"
+    ]
+
+
+def _held(found: Identified) -> list[str]:
+    """A note of what lies outside of the arm and could move by itself."""
+    held = held_parts(found.sim)
+    told = "these parts of the model do not move and touch nothing, since they are not between --base and --tip"
+    return _note(told, [*held[:MOST_NAMED], "…"] if len(held) > MOST_NAMED else held)
+
+
+def _ranges(found: Identified) -> list[str]:
+    """A note of joints that go further than the model lets them."""
+    names, own = found.sim.arm.names, found.sim.mujoco_model.jnt_range[list(found.sim.joints)]
+    out = [
+        f"{names[j]} (model {own[j, 0]:.2f} to {own[j, 1]:.2f} rad, corrected {low:.2f} to {high:.2f} rad)"
+        for j in widened_joints(found.sim)
+        for low, high in [found.sim.arm.range[j]]
+    ]
+    return _note("these joints move beyond the joint range of the model, where a simulation would stop them", out)
+
+
+def _beyond(found: Identified) -> list[str]:
+    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
+        if outside > 1.0 - SHARE:
+            out.append(f"{name}: {outside:.0%} of the held-out motion")
+    told = "these joints move outside of the range of the training recordings, where the band may be too narrow"
+    return _note(told, out)
+
+
+def _faster(found: Identified) -> list[str]:
+    """A note of the joints that are at times faster than in what is fitted of the training."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (np.abs(d.v[:, j][d.weight[:, j] > 0.0]) for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        if np.mean(other > fitted.max()) > AT_TIMES:
+            out.append(f"{name} up to {other.max():.2g} rad/s (in training {fitted.max():.2g})")
+    told = "the held-out motion is faster than all training motion, so the fit may not hold for it"
+    return _note(told, out, "add faster motion to --train")
+
+
+def _released(found: Identified) -> list[str]:
+    """A note of the joints whose servo is off at times in the held-out motion and never in what is fitted."""
+    off = [1.0 - data.served.mean((0, 2)) for data in (found.search.data, found.heldout)]
+    out = [
+        f"{name} for {100.0 * off[1][j]:.0f} % of the time"
+        for j, name in enumerate(found.sim.arm.names)
+        if off[0][j] == 0.0 < off[1][j]
+    ]
+    told = "the servo is off in part of the held-out motion, but never in training, so the fit may not hold there"
+    return _note(told, out, "add such a recording, with the servo off, to --train")

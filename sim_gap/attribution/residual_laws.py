@@ -91,7 +91,7 @@ def residual_laws(
     judge: ResidualSet,
     left_fit: Mapping[Row, Array],
     left: Mapping[Row, Array],
-    friction: Array | None = None,
+    friction: Array,
 ) -> list[ResidualLaw]:
     """The laws of what is left of training and held-out data, (K,) per row each, the largest first.
 
@@ -100,7 +100,7 @@ def residual_laws(
     wide = _samples(fit), _samples(judge)
     found = []
     for row in fit.rows:
-        sticks = 0.0 if friction is None else float(friction[row[1]])
+        sticks = float(friction[row[1]])
         for masks, any_torque in (((fit.valid[row], judge.valid[row]), 0.0), ((wide[0][row], wide[1][row]), sticks)):
             enough = min(mask.sum() for mask in masks) >= FEWEST
             if enough and root_mean_square(left[row][masks[1]]) > judge.margin[row] + any_torque:

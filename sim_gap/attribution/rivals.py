@@ -4,18 +4,19 @@ General laws (effects/registry.py) represent effects that the library lacks: a c
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
+from gcomp.estimate.choice import PRICE
 from gcomp.estimate.exchange import AS_GOOD as NO_FALL
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
 from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
-from sim_gap.search.term_equations import TermChoice, TermEquations
+from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
-AS_GOOD = 0.036
+AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
 """A rival is as good if its score, per independent measurement, is worse by no more than this: the price of three
 coefficients of a long recording, for the background of every arm can favour either by that much."""
 BARE = AS_GOOD / 3.0
@@ -57,30 +58,22 @@ GENERAL_MOTION = (
 )
 
 
-@dataclass(frozen=True)
-class Weighed:
-    """Score lost without a cause, and the effects that could replace it."""
-
-    evidence: float
-    confounded_with: tuple[str, ...]
-    separate_by: str | None
+def separating_motion(effect: str, rivals: Sequence[str]) -> str | None:
+    """What to record so that an effect and the first of its rivals differ; None without a rival."""
+    return SEPARATING_MOTION.get(frozenset({effect, rivals[0]}), GENERAL_MOTION) if rivals else None
 
 
 class Rivals:
     def __init__(self, choice: TermChoice) -> None:
         self.choice = choice
 
-    def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
+    def weigh(self, effect: str, terms: Sequence[Term]) -> tuple[float, tuple[str, ...]]:
         """Score lost without a cause at its best-founded place, if best replaced, and its equally good rivals."""
         choice = self.choice
         present = [term for term in choice.current if term in terms and term.effect == effect]
         outcomes = [self._replaced(term) for term in sorted(present, key=lambda term: (term.place, term.shape))]
         lost, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
-        confounded = tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
-        if not confounded:
-            return Weighed(max(lost, 0.0), (), None)
-        motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
-        return Weighed(max(lost, 0.0), confounded, motion)
+        return max(lost, 0.0), tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
 
     def _may_be_constants(self, terms: Sequence[Term]) -> bool:
         """Whether other constants of all motors, at the price of one effect, explain as much as all masses named."""
@@ -140,13 +133,9 @@ def _bends(term: Term) -> bool:
     return term.form.signature.side == "link" and term.effect != "transmission.spring"
 
 
-@dataclass(frozen=True)
-class StandIn:
-    worse: float
-    """How much worse it scores, per independent measurement: ½ log of the mean square summed over the rows; negative is
-    better, infinite without a law."""
-    law: str
-    """Its id; empty without a law."""
+StandIn = tuple[float, str]
+"""How much worse a law scores, per independent measurement (negative is better), and its id."""
+NO_LAW: StandIn = np.inf, ""
 
 
 class LawTest:
@@ -157,18 +146,15 @@ class LawTest:
         self.laws = [law for law in offered if law in self.choice.effects]
 
     def best_law(self, terms: Sequence[Term]) -> StandIn:
-        """The law that could best replace these terms.
-
-        Either one law replaces all of them, or each term has its own: then the term with the worst replacement counts.
-        """
+        """The law that could best replace these terms: one for all, or one each, of which the worst counts."""
         own = [term for term in self.choice.current if term in terms]
         apart = [self._instead([term]) for term in own]
-        found = [max(apart, key=lambda each: each.worse)] if apart else [StandIn(np.inf, "")]
-        return min([*found, self._instead(own)] if len(own) > 1 else found, key=lambda each: each.worse)
+        found = [max(apart, key=itemgetter(0))] if apart else [NO_LAW]
+        return min([*found, self._instead(own)] if len(own) > 1 else found, key=itemgetter(0))
 
     def _instead(self, own: Sequence[Term]) -> StandIn:
         """The best law in place of these terms and of others at its joint that are then not missed."""
-        choice, best = self.choice, StandIn(np.inf, "")
+        choice, best = self.choice, NO_LAW
         rest = choice.current
         for term in own:
             rest = choice.without(term, rest)
@@ -176,7 +162,7 @@ class LawTest:
         for law in choice.shortlist(rest, laws, LAWS_TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
-            best = min(best, StandIn(worse, law.effect), key=lambda each: each.worse)
+            best = min(best, (worse, law.effect), key=itemgetter(0))
         return best
 
     def _is_case(self, term: Term, of: Term) -> bool:

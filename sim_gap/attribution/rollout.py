@@ -13,8 +13,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
-from sim_gap.better_model.corrected_model import with_effects
-from sim_gap.better_model.export import CorrectedText, joint_effects, model_files
+from sim_gap.better_model.export import CorrectedText, joint_effects, model_files, with_effects
 from sim_gap.better_model.forward_effects import Effects, JointEffect
 from sim_gap.model.load import SimModel, named_spec, silent
 from sim_gap.residuals.preprocess import CHANNELS
@@ -81,10 +80,7 @@ def roll_out(
     causes: Sequence[Cause],
     laws: Sequence[JointEffect] = (),
 ) -> Rollout:
-    """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
-
-    Effects whose absence costs most come first.
-    """
+    """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out."""
     runs = RollOuts(sim, heldout, recordings, estimate, laws)
     horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
     before = runs.of((), windows)

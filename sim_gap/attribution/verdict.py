@@ -13,8 +13,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs, Verdict
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.location import row_rms
-from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet
+from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet, row_rms
 
 WEIGHTS = {"constant": -3.37, "evidence": 0.42, "left": -0.87, "elsewhere": -2.9, "outside": 1.3}
 """Weights of the constant and of each feature."""
@@ -74,10 +73,7 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
 
 
 def is_closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
-    """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row.
-
-    A row is near the noise within NEAR times its margin, or with no more than ROW_LEFT of its own RMS left.
-    """
+    """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row."""
     before, after = row_rms(data), row_rms(data, left)
     near = all(rms <= max(NEAR * data.margin[row], ROW_LEFT * before[row]) for row, rms in after.items())
     return near and float(np.sqrt(share_left(data, left))) <= EXPLAINED

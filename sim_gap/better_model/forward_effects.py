@@ -30,7 +30,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from gcomp.arm.rigid_body import CREEP
 from gcomp.arrays import Array
+from sim_gap.effects.torque import GRADUAL
 
 JointEffect = tuple[str, str, dict[str, Any]]
 """Effect, joint, parameters: a number each; of a law, its points `at`, the `torque` there, and whether it is `directed`
@@ -51,10 +53,6 @@ PASSIVE = (
     *LAWS,
 )
 """Effects that act on the joints themselves."""
-CREEPING = 0.01
-"""Speed below which the direction of a motion is not defined [rad/s]."""
-GRADUAL = (0.25, 0.75, 1.25, 1.75)
-"""Half widths of the plays of a hysteresis that sets in gradually, as shares of its width."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
 """Length of a forward simulation from a recorded state, number of them over a recording, largest time step, also of a
 model whose actuators have delays."""
@@ -148,7 +146,7 @@ class Effects:
             amount = law["directed"] and name in ("law.velocity", "law.load")
             at, torque = np.array(law["at"]), np.array(law["torque"])
             taken = xp.interp(xp.abs(value[..., k]) if amount else value[..., k], at, torque)
-            taken = taken * xp.clip(speed[..., k] / CREEPING, -1.0, 1.0) if law["directed"] else taken
+            taken = taken * xp.clip(speed[..., k] / CREEP, -1.0, 1.0) if law["directed"] else taken
             out = out + taken[..., None] * np.eye(len(self.joints))[k]
         return out
 
@@ -205,7 +203,7 @@ class Effects:
         An elastic transmission or one with backlash shows in the position, whose sensor is at the motor; its
         oscillation is neglected.
         """
-        torque = self.carried(model, data) - self._pushed(model, data)
+        torque = self.carried(model, data) - self._pushed(data)
         give = self._give(torque)
         return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
@@ -218,7 +216,7 @@ class Effects:
         """Readings of the position sensors after a step [rad], (n,)."""
         return self.angle(data.qpos[self.places]) if self.rigid else self.read(model, data)[0]
 
-    def _pushed(self, model: Any, data: Any) -> Array:
+    def _pushed(self, data: Any) -> Array:
         """Torque of stops and contacts on the links, (n,)."""
         rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
         push = data.qfrc_constraint.copy()

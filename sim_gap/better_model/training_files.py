@@ -15,7 +15,7 @@ from armlink.errors import BadInput
 from gcomp.arm.model_file import linear_part
 from gcomp.arrays import Array
 from sim_bus.effects.registry import effects as simulated
-from sim_gap.better_model.corrected_model import with_effects
+from sim_gap.better_model.export import with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term
@@ -168,14 +168,9 @@ LEAST_DRAW_SHARE = 0.01
 """A draw of a parameter that must be above zero is at least this share of its estimate."""
 
 
-def drawn_parameters(
-    estimate: EffectEstimate, names: Sequence[str], count: int, seed: int = 0
-) -> list[dict[str, float]]:
-    """Draws of what the arm has, `JOINT.EFFECT.PARAMETER` → value in SI units; effects on the whole arm are `arm.…`.
-
-    What only some recordings have, such as a body in the hand, is left out. Values are kept within what the simulated
-    arm accepts: no friction, rotor or play is below zero.
-    """
+def drawn_parameters(estimate: EffectEstimate, names: Sequence[str], count: int) -> list[dict[str, float]]:
+    """Draws of what the arm has in all recordings, `JOINT.EFFECT.PARAMETER` → value in SI units; effects on the whole
+    arm are `arm.…`."""
     terms = [term for term in estimate.terms if not term.bound]
     best = {term: {name: each.value for name, each in estimate.parameters(term).items()} for term in terms}
 
@@ -188,12 +183,12 @@ def drawn_parameters(
             for term, values in row.items()
             for name, value in values.items()
         }
-        for row in estimate.draws(terms, count, seed)
+        for row in estimate.draws(terms, count, seed=0)
     ]
 
 
 def _accepted(effect: str, name: str, value: float, best: float) -> float:
-    """A value within the bounds that the simulated arm has for it."""
+    """A value within the bounds that the simulated arm has for it: no friction, rotor or play is below zero."""
     known = simulated().get(effect)
     one = next((each for each in known.parameters if each.name == name), None) if known else None
     if one is None or not one.accepts(best):

@@ -69,7 +69,6 @@ class BenchArm:
 
 
 def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm:
-    """Draw a nominal arm of `joints` joints, by default 3 to 7."""
     n = int(random.integers(3, 8)) if joints is None else joints
     length = np.linspace(random.uniform(0.25, 0.45), random.uniform(0.08, 0.2), n) * random.uniform(0.7, 1.3, n)
     mass = np.geomspace(random.uniform(5.0, 14.0), random.uniform(1.0, 2.5), n) * random.uniform(0.8, 1.25, n)
@@ -112,7 +111,6 @@ def perturb(arm: BenchArm, random: np.random.Generator) -> BenchArm:
 
 
 def mjcf(arm: BenchArm, more: Sequence[str] = ()) -> str:
-    """The arm as MJCF text, with further lines at its end."""
     lines = [
         '<mujoco model="arm">',
         '<compiler angle="radian"/>',

@@ -96,9 +96,8 @@ def run_bench(
 ) -> dict[str, Any]:
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
-    `lengths` are the seconds of training and held-out recordings, by default 120 and 40; `effects` is the number of
-    effects in every case such as `5-8`, empty for none, one or two. With `positions`, arms with servos of which `q` and
-    `q_cmd` alone are seen, none or one effect each, by default 36 s and 18 s. `progress` gets stage, done, total.
+    `lengths` are the seconds of training and held-out recordings; `effects` is the number of effects in every case such
+    as `5-8`, empty for none, one or two. With `positions`, arms have servos and only `q` and `q_cmd` are seen.
     `diagnose` must be a module-level function if `workers` exceeds 1. Cases that no arm shows are left out, and counted
     in the score. Raises BadInput if `out` holds an earlier check.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
 from sim_bus.effects.registry import imperfections
-from sim_gap.blind.arms import BenchArm, inverse, mjcf
+from sim_gap.blind.arms import inverse, mjcf
 from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import RATE, RECORDED_HZ
 from sim_gap.blind.plant import TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
@@ -44,29 +44,6 @@ DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
 """Of a column in a file; 5 of the others."""
 Columns = dict[str, Array]
 Gap = dict[str, list[float]]
-
-
-def gap(model: Any, arm: BenchArm, columns: Columns) -> Gap:
-    """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
-    from scipy.signal import butter, sosfiltfilt
-
-    t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RECORDED_HZ)
-    even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
-    low = butter(4, BAND_HZ, fs=RECORDED_HZ, output="sos")
-    q = sosfiltfilt(butter(4, 15.0, fs=RECORDED_HZ, output="sos"), even["q"], axis=0)
-    v = np.gradient(q, 1.0 / RECORDED_HZ, axis=0)
-    a = np.gradient(v, 1.0 / RECORDED_HZ, axis=0)
-    motor = inverse(model, q, v, a)
-    link = motor - arm.armature * a
-    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / LEAST_SPEED)
-    out = {}
-    for channel, nominal in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
-        rest = sosfiltfilt(low, even[channel] - nominal, axis=0)[100:-100]
-        # at rest friction is undetermined, which no sensor on the link reads
-        counts = (np.abs(v[100:-100]) > LEAST_SPEED) | (channel == "tau")
-        mean = np.where(counts, rest**2, 0.0).sum(0) / np.maximum(counts.sum(0), 1)
-        out[channel] = np.sqrt(mean).tolist()
-    return out
 
 
 def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
@@ -151,7 +128,27 @@ class TorqueRig(Rig):
         return Trial(record(truth, command, log, self.noise(1000 + number)), log.position, is_steady)
 
     def gap(self, trial: Trial) -> Gap:
-        return gap(self.scene.model, self.scene.arm, trial.columns)
+        """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
+        from scipy.signal import butter, sosfiltfilt
+
+        arm, columns = self.scene.arm, trial.columns
+        t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RECORDED_HZ)
+        even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
+        low = butter(4, BAND_HZ, fs=RECORDED_HZ, output="sos")
+        q = sosfiltfilt(butter(4, 15.0, fs=RECORDED_HZ, output="sos"), even["q"], axis=0)
+        v = np.gradient(q, 1.0 / RECORDED_HZ, axis=0)
+        a = np.gradient(v, 1.0 / RECORDED_HZ, axis=0)
+        motor = inverse(self.scene.model, q, v, a)
+        link = motor - arm.armature * a
+        motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / LEAST_SPEED)
+        out = {}
+        for channel, nominal in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
+            rest = sosfiltfilt(low, even[channel] - nominal, axis=0)[100:-100]
+            # at rest friction is undetermined, which no sensor on the link reads
+            counts = (np.abs(v[100:-100]) > LEAST_SPEED) | (channel == "tau")
+            mean = np.where(counts, rest**2, 0.0).sum(0) / np.maximum(counts.sum(0), 1)
+            out[channel] = np.sqrt(mean).tolist()
+        return out
 
 
 class ServoRig(Rig):
@@ -311,7 +308,6 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
 def make_cases(
     out: str, seed: int, cases: int, workers: int, lengths: Sequence[float], effects: str = "", positions: bool = False
 ) -> None:
-    """Make all cases of a check in folders below `out`, in parallel."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     low, _, high = effects.partition("-")
     wanted = recipes(seed, cases, (int(low), int(high)) if high else None)

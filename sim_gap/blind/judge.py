@@ -85,7 +85,7 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
         named=bool(offered & names),
         tellable=bool(truths) and not any(t["undecided"] for t in truths),
         found=tuple(t["effect"] for t in truths if t["effect"] in {c["effect"] for c in causes}),
-        blamed=_blamed(causes, label, withheld),
+        blamed=_blamed(causes, label, truths, implied),
         joints=_joints(causes, truths),
         errors=tuple(error for t in truths for error in _parameter_errors(causes, t)),
         shrink=shrink,
@@ -97,7 +97,6 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
 
 
 def _shown(label: Json, truths: Sequence[Json]) -> list[Json]:
-    """Of several effects, those that alone at least double the gap of the sound arm somewhere."""
     if label["kind"] != "several":
         return []
     falls = zip(label["effects"], label["gap"]["falls"], strict=True)
@@ -111,16 +110,15 @@ def _placed(causes: Sequence[Json], truth: Json) -> bool:
     return any(not truth["joints"] or set(truth["joints"]) & set(c["joints"]) for c in named)
 
 
-def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ...]:
+def _blamed(causes: Sequence[Json], label: Json, truths: Sequence[Json], implied: set[str]) -> tuple[str, ...]:
     """Confident causes that are not true.
 
     Excused: effects implied by a true one, rivals of an effect that this motion cannot separate, and causes that follow
     every true effect and lower the gap by no more than this arm's small errors do at the same joints.
     """
-    present = [t for t in label["effects"] if t["effect"] != withheld]
-    fine = {name for t in label["effects"] for name in t["implied"]} | {t["effect"] for t in present}
-    fine |= {name for t in present if t["undecided"] for name in t["confused_with"]}
-    out, due = [], {t["effect"] for t in present}
+    due = {t["effect"] for t in truths}
+    fine = implied | due | {name for t in truths if t["undecided"] for name in t["confused_with"]}
+    out = []
     for cause in causes:
         due.discard(cause["effect"])
         if cause["effect"] in fine or cause["confidence"] <= CONFIDENT:

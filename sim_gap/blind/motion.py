@@ -28,7 +28,6 @@ class MotionLimits:
 
     @property
     def centre(self) -> Array:
-        """Middle of the range [rad]."""
         return 0.5 * (self.lower + self.upper)
 
     @property

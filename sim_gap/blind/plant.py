@@ -55,7 +55,6 @@ class TrueArm:
 
     @property
     def encoder_step(self) -> float:
-        """Resolution of the position sensor [rad]."""
         return float(2 * np.pi / 2**self.encoder_bits)
 
 

@@ -80,7 +80,6 @@ def _answer(folder: Path, case: Json, withheld: str) -> Json:
 
 
 def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recording], list[str]]:
-    """Training and held-out recordings of a case, and their labels."""
     train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
     if "share" in case:
         cuts = [int(case["share"] * len(each.t)) for each in train]

@@ -172,7 +172,6 @@ def _limits(arm: BenchArm, servos: bool, random: np.random.Generator) -> MotionL
 
 
 def _servo_law(scene: Scene, random: np.random.Generator) -> ServoLaw:
-    """Bandwidth and damping of hobby servos."""
     omega, zero = 2 * np.pi * random.uniform(2.5, 5.0, scene.arm.n), np.zeros((3, scene.arm.n))
     damping = 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega
     return ServoLaw(scene.inertia * omega**2, damping, zero[0], zero[1], np.full(scene.arm.n, np.inf), zero[2])

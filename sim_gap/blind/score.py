@@ -167,7 +167,6 @@ def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
 
 
 def case_row(j: Judgement) -> dict[str, Any]:
-    """One case as a row of the table of all cases."""
     same = ("case", "kind", "tellable", "verdict", "confidence", "first_right", "named")
     return {
         **{name: getattr(j, name) for name in same},

@@ -1,10 +1,7 @@
-"""Entry point of the check: recordings and a model in, corrected recordings and findings out.
+"""Entry point of the check, before anything is fitted: recordings and a model in, corrected recordings and findings
+out."""
 
-Run before anything is fitted. A finding that is certain is corrected; one that is not names the options that settle it,
-and the recording is diagnosed as it is. Times, counts, jumps and ranges that no arm can have end the diagnosis, and
-without a torque channel commands that do not belong to the positions do.
-"""
-
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -12,7 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
-from armlink.recording.recording import TORQUE_CHANNELS, Recording
+from armlink.recording.recording import TORQUE_CHANNELS, Recording, default_names, take_joints
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import SIGNIFICANT
@@ -35,11 +32,8 @@ WAY_STEP_S = 0.1
 
 
 def goes_one_way(recording: Recording) -> bool:
-    """Whether the joints that move go to and fro less than once, or none moves.
-
-    Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
-    curve as well as the right one does.
-    """
+    """Whether the joints that move go to and fro less than once, or none moves: a wrong column, sign or zero may fit
+    one smooth curve over time as well as the right one does."""
     _, q = _thinned(recording)
     span = np.ptp(q, axis=0)
     moving = span > LEAST_RANGE
@@ -75,16 +69,10 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
 def check_recordings(
     arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
 ) -> tuple[list[Recording], list[RecordingFinding]]:
-    """Correct recordings whose mapping, units or clocks are certainly wrong.
+    """Recordings of one set-up with what is certainly wrong of mapping, units and clocks corrected, and all findings.
 
-    Args:
-        arm: nominal arm, its joints in the recordings' order.
-        recordings: recordings of one set-up, in SI as far as is known.
-        labels: their names for messages.
-        stated: corrections that the user stated, already made; those are not looked into again.
-
-    Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
-    findings. Raises BadInput for times, counts and angles that no arm can have.
+    What is not certain is left as recorded, and what is `stated` is made already and not looked into again. Raises
+    BadInput for times, counts and angles that no arm can have.
     """
     each = [check_recording(arm, r, label, stated) for r, label in zip(recordings, labels, strict=True)]
     columns = {"q", *CHANNELS}
@@ -103,7 +91,7 @@ def check_recordings(
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections, known: Collection[str] = ()
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """Check and correct one recording, as `check_recordings`; `known` are options that corrected others."""
+    """One recording, as in `check_recordings`; `known` are options that corrected others."""
     refuse(label, find_time_unit(recording, stated), find_counts(recording, stated))
     recording, wrapped = unwrap(recording)
     refuse(label, find_jumps(recording, stated))
@@ -135,7 +123,7 @@ def _with_right_columns(
     other."""
     found, s = list[RecordingFinding](), _prepared(recording, arm, label, stated)
     for channel in CHANNELS:
-        while channel in s.channels and len(found) < 2 * arm.n:
+        while channel in s.reading and len(found) < 2 * arm.n:
             motion = motion_of(s, channel)
             silent = motion.reading.std(0) < SIGNIFICANT * s.noise[channel]
             if silent.all():  # an arm that swings, its drives off
@@ -253,3 +241,70 @@ def check_position_only(
         checked.append(recording)
         found += [finding for finding in (*repeated, *jitter, *dropped) if finding not in found]
     return checked, found
+
+
+# ---- joints of a recording and of the model, matched by name where the recording has names
+
+FILLERS = {"joint", "joints", "jnt", "motor", "link", "arm", "robot", "actuator", "axis", "j", "pos"}
+"""Words of joint names that say nothing about which joint it is."""
+
+
+def match_joints(
+    recording: Recording, model: Sequence[str], stated: Corrections, label: str
+) -> tuple[Recording, list[RecordingFinding]]:
+    """The recording's joints in the order of the model's (base to tip), named as there, and a finding where names were
+    matched that differ. Raises BadInput where it is not certain which joint is which.
+
+    With `joints` stated, those are the model's, whatever they are called; without names the columns' order counts.
+    """
+    own = recording.names
+    if stated.joints:
+        return (replace(recording, names=tuple(model)) if len(own) == len(model) else recording), []
+    known = [name for name in model if name in own]
+    if known and (len(known) == len(model) or len(known) == len(own)):
+        return _taken(recording, known, known), []
+    if own == default_names(recording.n):
+        return recording, []
+    matched = _by_words(own, model)
+    if matched is None and any(column.startswith("q_") for column in stated.columns):
+        return replace(recording, names=default_names(recording.n)), []  # the order is that of --map
+    if matched is None:
+        raise BadInput(
+            f"{label}: the recording has the joints ({', '.join(own)}), but the model has "
+            f"({', '.join(model)}): name the joints of the recording in the order of the model, for example "
+            f"--joints {','.join(own[: len(model)])}"
+        )
+    pairs = ", ".join(f"{name} as {to}" for to, name in matched.items())
+    finding = RecordingFinding(
+        "order", "q", "all", f"the joints were matched by name: {pairs}", "--joints " + ",".join(matched.values()), True
+    )
+    return _taken(recording, list(matched.values()), list(matched)), [finding]
+
+
+def _taken(recording: Recording, names: Sequence[str], called: Sequence[str]) -> Recording:
+    left = [name for name in recording.names if name not in names]
+    taken = take_joints(recording, [recording.names.index(name) for name in names], tuple(called))
+    note = f"joints left out because the model does not have them: {', '.join(left)}" if left else ""
+    return replace(taken, warning="; ".join(filter(None, (recording.warning, note))))
+
+
+def _by_words(own: Sequence[str], model: Sequence[str]) -> dict[str, str] | None:
+    """Model joint → recorded joint, where each model joint has exactly one recorded one with its words."""
+    words = {name: _words(name) for name in own}
+    matched = {}
+    for name in model:
+        wanted = _words(name)
+        if not wanted:
+            return None
+        equal = [other for other in own if words[other] == wanted]
+        near = equal or [other for other in own if words[other] and (words[other] > wanted or words[other] < wanted)]
+        if len(near) != 1:
+            return None
+        matched[name] = near[0]
+    return matched if len(set(matched.values())) == len(model) else None
+
+
+def _words(name: str) -> frozenset[str]:
+    """Words and numbers of a joint's name that tell it from others."""
+    parts = re.findall(r"[a-z]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+    return frozenset(part.lstrip("0") or "0" if part.isdigit() else part for part in parts) - FILLERS

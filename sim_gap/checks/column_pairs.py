@@ -45,7 +45,6 @@ class ColumnPairs:
         return bool(self.judged.any() and np.mean(same[self.judged]) > 0.5)
 
     def holds(self, column: int) -> int:
-        """The joint whose motion a column holds."""
         return int(np.abs(self.match[column]).argmax())
 
     def wrong(self) -> dict[Kind, list[int]]:

@@ -16,11 +16,8 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
-from sim_gap.checks.sound_arm import ChannelMotion, likelihood, quick_costs
+from sim_gap.checks.sound_arm import CERTAIN_COST, ChannelMotion, likelihood, quick_costs
 
-CERTAIN_FALL = 5.0 * PRICE
-"""Fall of the negative log likelihood from which a correction is certain: as rare an effect as any of the library has
-paid then, and the choice among the hundred changes that are looked at."""
 SCREENING_ROWS = 150
 """Rows that are enough to see that a hypothesis is wrong."""
 MOST_CANDIDATES = 8
@@ -105,10 +102,9 @@ def find_wrong_columns(
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
     """Fall of the cost by each hypothesis, less the price, on some of the rows, (M,)."""
-    few = slice(None, None, max(1, len(motion.q) // SCREENING_ROWS))
     changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
     moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]
-    motions = [each.rows(few) for each in changed]
+    motions = [each.thinned(SCREENING_ROWS) for each in changed]
     made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
     models = dict(zip(moved, np.split(made, len(moved)), strict=True))
     costs = quick_costs(arm, np.array([models.get(k, models[0]) for k in range(len(motions))]), motions)
@@ -133,7 +129,7 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
         before = likelihood(arm, replace(motion, reading=np.where(gone, np.nan, motion.reading))).costs
     falls = before - likelihood(arm, changed).costs
     price = 0.0 if known else PRICE * hypothesis.choices
-    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_FALL)
+    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_COST)
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
@@ -146,7 +142,7 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of more than two columns, of positions, of torques and of both: exchange after exchange from those that
     explain most after the one before; none where no exchange explains more than the order as it is recorded."""
-    found, few = list[Hypothesis](), motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
+    found, few = list[Hypothesis](), motion.thinned(ORDER_ROWS)
     for channels, joints in exchangeable(arm, motion, follows):
         orders = [tuple(range(arm.n))]
         for _ in joints[1:MOST_CANDIDATES]:

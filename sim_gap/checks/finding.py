@@ -52,9 +52,7 @@ def refuse(label: str, *found: RecordingFinding | None) -> None:
 def exchange_option(channel: str, holds: Mapping[int, int]) -> str:
     """The `--map` that gives every joint its column; empty where none can, since some joint's motion is in no column.
 
-    Args:
-        channel: prefix of the columns, such as `dq`.
-        holds: column that is wrong → joint whose motion it holds, both from 0.
+    `holds`: column that is wrong → joint whose motion it holds, both from 0.
     """
     if set(holds) != set(holds.values()):
         return ""

@@ -15,7 +15,6 @@ from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
 from sim_gap.checks.sound_arm import ChannelMotion, measurements
 
-DEGREE = math.pi / 180.0
 LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
 DRIVE_DELAYS = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
@@ -75,7 +74,7 @@ def _signs(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
     positions = ("q", *follows)
     for joints in [every, *((j,) for j in every if arm.n > 1)]:
         own = None if len(joints) == arm.n else joints[0]
-        text, factor = _option("sign", [channel], "-1", own), _sign(arm.n, joints)
+        text, factor = _option("sign", [channel], "-1", own), np.where(np.isin(every, joints), -1.0, 1.0)
         yield Hypothesis("sign", (channel,), joints, opposite, text, partial(_torques, factor=factor))
         if len(joints) == 1:
             text, change = _option("sign", positions, "-1", joints[0]), partial(_positions, factor=factor)
@@ -95,7 +94,7 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
     positions, every = ("q", *follows), tuple(range(arm.n))
     far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
     if far:
-        text, change = _option("units", positions, "deg"), partial(_positions, factor=DEGREE)
+        text, change = _option("units", positions, "deg"), partial(_positions, factor=math.radians(1.0))
         yield Hypothesis("scale", ("q",), every, "the positions are in degrees", text, change)
     for j, angle in product(every, (0.5 * math.pi, -0.5 * math.pi, math.pi)):
         text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
@@ -180,13 +179,11 @@ def exchangeable(
 
 
 def exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
-    """An order with two places exchanged."""
     places = dict(zip(pair, pair[::-1], strict=True))
     return tuple(order[places.get(j, j)] for j in range(len(order)))
 
 
 def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
-    """Columns of some channels in another order."""
     touched = tuple(j for j, other in enumerate(order) if j != other)
     names = ", ".join(arm.names[j] for j in touched)
     what = (
@@ -200,11 +197,6 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
         return _torques(motion, order) if torque in channels else motion
 
     return Hypothesis("order", tuple(channels), touched, what, option, change, choices=len(touched) - 1)
-
-
-def _sign(n: int, joints: Sequence[int]) -> Array:
-    """Factors that turn the signs of some joints, (n,)."""
-    return np.where(np.isin(np.arange(n), joints), -1.0, 1.0)
 
 
 def _positions(

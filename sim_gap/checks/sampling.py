@@ -68,10 +68,8 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
         f"{before / max(after, 1e-12):.1f} times smoother: t is the time of receipt, not of measurement"
     )
-    values = {**vars(recording), "t": sampled}
-    return Recording(**values), [
-        RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (to keep the times)", True)
-    ]
+    found = RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (to keep the times)", True)
+    return replace(recording, t=sampled), [found]
 
 
 def _sample_times(t: Array) -> Array | None:
@@ -177,8 +175,9 @@ HELD = 0.3
 
 def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with positions that were read less often than the rows come, and repeated, filled in between."""
-    same = _repeats(recording.position) & fast_rows(recording.position)
-    share = float(same.sum()) / max(float(fast_rows(recording.position).sum()), 1.0)
+    fast = fast_rows(recording.position)
+    same = _repeats(recording.position) & fast
+    share = float(same.sum()) / max(float(fast.sum()), 1.0)
     if share < HELD:
         return recording, []
     velocity, known = recording.velocity, np.repeat(~same[:, None], recording.n, axis=1)

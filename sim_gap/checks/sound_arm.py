@@ -50,8 +50,10 @@ class ChannelMotion:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
         return _telling(self.v, self.reading, self.channel == "tau")
 
-    def rows(self, rows: slice) -> "ChannelMotion":
-        q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
+    def thinned(self, count: int) -> "ChannelMotion":
+        """Some `count` of its rows or more, evenly spread."""
+        step = max(1, len(self.q) // count)
+        q, v, a, reading = (x[::step] for x in (self.q, self.v, self.a, self.reading))
         return replace(self, q=q, v=v, a=a, reading=reading)
 
 
@@ -66,7 +68,7 @@ def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     thin = slice(None, None, max(1, len(t) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
     size, idle = reading.std(0), np.ones(reading.shape[1], bool)
-    rubs = channel != "tau" or "tau_motor" in s.channels
+    rubs = channel != "tau" or "tau_motor" in s.reading
     return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, idle, rubs)
 
 
@@ -97,8 +99,9 @@ ERROR_LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
 """Least and largest such error of a sound arm, as a share: a torque below a third of the model's is in another unit."""
 IDLE_COST = 4.0 * PRICE
 """Negative log likelihood of a motor that is idle, or of a dead sensor: the price of an effect that few arms have."""
-RANGE_COST = 5.0 * PRICE
-"""Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
+CERTAIN_COST = 5.0 * PRICE
+"""Negative log likelihood of what no sound arm has, such as a joint beyond its range: as rare an effect as any of the
+library has paid then, and the choice among the hundred changes that are looked at."""
 JOINT_EFFECTS, FRICTION_EFFECTS, CARRIED = 6, 3, (0, 2)
 """Effects of a joint that act on it alone; those of them that are friction and a rotor; places of those in which the
 pose shows, which an idle motor or a dead sensor has not: the model's torque and a spring."""
@@ -150,7 +153,6 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    """The same, all at once."""
     q, v, a, read, size, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
         for name in ("q", "v", "a", "reading", "size", "idle", "rubs")
@@ -171,7 +173,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     without[..., CARRIED, :], without[..., :, CARRIED] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
-    whole += RANGE_COST * beyond_range(arm, q)
+    whole += CERTAIN_COST * beyond_range(arm, q)
     return np.asarray((whole - count * np.log(np.maximum(size, SMALLEST_TORQUE))).sum(1))
 
 
@@ -246,7 +248,7 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))
-    return ChannelLikelihood(costs + RANGE_COST / FOLDS * beyond_range(arm, motion.q)[:, None], idle)
+    return ChannelLikelihood(costs + CERTAIN_COST / FOLDS * beyond_range(arm, motion.q)[:, None], idle)
 
 
 Columns = tuple[Array, Array, Array]

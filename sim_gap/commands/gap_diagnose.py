@@ -223,7 +223,6 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
 
 
 def show(answer: "Diagnosis", console: "Console") -> None:
-    """Print causes and gap as tables, then the notes."""
     from rich.table import Column, Table
 
     from sim_gap.report.effect_text import parameter_rows

@@ -1,6 +1,5 @@
 """Diagnoses the recordings of a fleet on a cluster of workers, and those of one arm in turn."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -90,7 +89,6 @@ def diagnose_fleet(
 
 
 def _show(rows: list[dict[str, Any]], console: Any) -> None:
-    """Print how often each effect was found and on how many arms, then the cases that could not be diagnosed."""
     from rich.table import Table
 
     cases = {row["case"]: row["verdict"] for row in rows}
@@ -111,7 +109,6 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
 
 
 def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
-    """Print what changes on which arm, and which arm differs from the others."""
     from rich.table import Table
 
     if trends:
@@ -126,9 +123,6 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} is {one['value']:.3g} "
             f"{one['unit']}, but {one['others']:.3g} on the other arms"
         )
-
-
-UNDATED = datetime.min.replace(tzinfo=UTC)
 
 
 @reads_recordings
@@ -157,7 +151,7 @@ def trend(
     from armlink.commands.plain_console import PlainConsole, results
     from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled
-    from sim_gap.trends import date_of, fleet_trends, needed_recordings, rows
+    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)

@@ -4,24 +4,21 @@ What does not follow the command shows in it against the drive's own estimate; i
 estimate, against the sensor or the model.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
-    CLIPPED,
-    NEAR_ONE,
+    CUT_OFF,
     InverseEffect,
     Plausibility,
     SearchHints,
-    Shape,
     Signature,
     delay_effect,
     exceeded_levels,
 )
-from sim_gap.residuals.preprocess import PreparedSignals
 
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
@@ -49,11 +46,6 @@ def _clipped(command: Array, limit: float, _rate: float) -> Array:
     return np.asarray(command - np.clip(command, -limit, limit))
 
 
-def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
-    """Levels of the command [N·m]."""
-    return exceeded_levels(np.concatenate([s.reading["tau_cmd"][:, place] for s in signals]))
-
-
 EFFECTS = (
     InverseEffect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
         "actuator.gain",
@@ -76,8 +68,8 @@ EFFECTS = (
     InverseEffect(
         "actuator.saturation",
         _missing(_clipped),
-        Plausibility(prior_mean=1.0, prior_std=CLIPPED, bounds=NEAR_ONE),
-        SearchHints(shapes_for=_levels),
+        CUT_OFF,
+        SearchHints(shapes_for=exceeded_levels(lambda s, joint: s.reading["tau_cmd"][:, joint])),
         parameters_of=lambda _, shape, _beneath: [shape[0]],
     ),
 )

@@ -1,9 +1,4 @@
-"""The inverse form of an effect, in three parts: how it shows, what is plausible, and hints to the search.
-
-The `Signature` gives the columns of an effect in the residuals, linear in its coefficients at a given shape. The
-`Plausibility` holds its priors and the values that can exist. The `SearchHints` say where to start and which simpler
-effects compete.
-"""
+"""The inverse form of an effect: how it shows (`Signature`), what is plausible, and hints to the search."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,12 +9,14 @@ import numpy as np
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import ChannelLayout, Columns
-from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 Shape = tuple[float, ...]
 """Nonlinear parameters of an effect, such as its Stribeck velocity."""
 Key = tuple[str, int]
 """Id of an effect and the index of a joint or link (0 for the whole arm)."""
+Starts = Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]
+"""Shapes to start with, of recordings and place."""
 Column = Callable[[PreparedSignals, int, Shape], Array]
 """The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
 Beneath = Mapping[str, Array]
@@ -64,7 +61,7 @@ class Signature:
     """How an effect shows in a recording."""
 
     columns: Callable[[PreparedSignals, ChannelLayout, int, Shape], Columns]
-    """Columns at the work rate, by row."""
+    """Columns at the work rate, by row, linear in the coefficients at a given shape."""
     channel: Channel | tuple[Channel, ...] = "any"
     whole_arm: bool = False
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
@@ -82,11 +79,6 @@ class Signature:
 
     slopes: Callable[[PreparedSignals, ChannelLayout, Shape, Array], Columns] | None = None
     """Of a nonlinear effect: its columns about fitted coefficients."""
-
-    def present(self, shape: Shape, number: int) -> bool:
-        """Whether recording `number` has it: what belongs to the arm is in all of them, a body not in those without."""
-        numbers = self.recordings(shape)
-        return not self.body if number == ABSENT else not numbers or number in numbers
 
     def places(self, layout: ChannelLayout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
@@ -166,7 +158,7 @@ class SearchHints:
 
     shapes: tuple[Shape, ...] = ((),)
     """Shapes to start with; the best one is then refined between its neighbours."""
-    shapes_for: Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]] | None = None
+    shapes_for: Starts | None = None
     """The same for given recordings and place."""
     discrete: frozenset[int] = frozenset()
     """Entries of the shape that are the number of something (a joint, a recording): they are not refined."""
@@ -207,16 +199,21 @@ class InverseEffect:
 
 SHORTEST_DELAY = 1e-3
 """Shortest time that counts as a delay or a lag [s]."""
-CLIPPED = 0.2
-"""Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
 NEAR_ONE = (0.6, 1.6)
-"""Bounds of such a coefficient."""
+"""Bounds of a coefficient whose effect the shape alone determines."""
+CUT_OFF = Plausibility(prior_mean=1.0, prior_std=0.2, bounds=NEAR_ONE)
+"""Of a level, beyond which all is cut off."""
 
 
-def exceeded_levels(values: Array) -> tuple[Shape, ...]:
-    """Levels that a signal (K,) exceeds during some of the time, to start with."""
+def exceeded_levels(signal: Callable[[PreparedSignals, int], Array]) -> Starts:
+    """Levels that a signal (K,) of recording and joint exceeds during some of the time, to start with."""
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
-    return tuple((float(level),) for level in np.quantile(np.abs(values), shares))
+
+    def levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
+        values = np.abs(np.concatenate([signal(s, place) for s in signals]))
+        return tuple((float(level),) for level in np.quantile(values, shares))
+
+    return levels
 
 
 def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:

@@ -73,9 +73,7 @@ def _viscous_or_load(_layout: ChannelLayout, place: int, _shape: Shape) -> tuple
 
 def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
     """Friction is (1 + ratio) times as large in one direction and (1 − ratio) in the other; of its Coulomb part."""
-    dry = float(
-        beneath["friction.coulomb"][0] + beneath["nominal"][0]
-    )  # the nominal model's, and what was found beside
+    dry = float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
     return coefficients / max(abs(dry), 1e-9)
 
 

@@ -41,10 +41,8 @@ def link_rows(signals: PreparedSignals, layout: ChannelLayout, link: int, column
 
 
 def _mass_moment(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
-    """An error of a link's first moment m·s; its inertia about the joint changes with it.
-
-    If only the inertia that comes with it would show, it is an error of the inertia and not of the moment.
-    """
+    """An error of a link's first moment m·s, and with it of its inertia; where that alone would show, none of the
+    moment."""
     own, inertial = signals.link_regressor(place), signals.arm.inertial[place]
     centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
     moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(centre)
@@ -177,7 +175,7 @@ def _starts(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...
     nominal = signals[0].arm.gravity
     gram, side = 1e-9 * np.eye(3), np.zeros(3)
     for s in signals:
-        channel = "tau" if "tau" in s.reading else s.channels[0]
+        channel = "tau" if "tau" in s.reading else next(iter(s.reading))
         for joint in range(s.n):
             moved = np.column_stack([np.ones(len(s.t)), s.direction[:, joint], s.v[:, joint]])
             columns = np.column_stack([s.gravity_columns[:, joint], s.reading[channel][:, joint] - s.model[:, joint]])

@@ -32,10 +32,8 @@ Error = Callable[[Array], tuple[Array, ...]]
 
 
 def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves: Array, size: float = 0.0) -> Columns:
-    """Change of the model torque per unit of each coefficient that moves a joint: (K, p, 3) → (K, p) by row.
-
-    The secant over `size` of the first coefficient, or the derivative if that is no larger than a difference's step.
-    """
+    """Change of the model torque per unit of each coefficient that moves a joint, (K, p, 3) → (K, p) by row: the secant
+    over `size` of the first one, or the derivative if that is no larger than a difference's step."""
     if abs(size) > POSITION_STEP:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):

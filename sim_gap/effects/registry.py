@@ -1,10 +1,7 @@
 """The library of effects in their inverse form, one module a family, and the general laws beside it.
 
-A law is what a gap may follow if its cause is not in the library: a smooth function of one quantity (position,
-velocity, acceleration, load or time: the regimes of a gap) in one channel of one joint, a position that is read with a
-constant or proportional error, a delay to second order, any rigid body fixed to a link, or gravity of another direction
-or size. Laws are compared with causes, never reported: a cause that a law could replace is not certain, for unknown
-effects could look the same in this motion.
+A law is what a gap may follow if its cause is not in the library. Laws are compared with causes, never reported: a
+cause that a law could replace is not certain, for unknown effects could look the same in this motion.
 """
 
 from collections.abc import Sequence
@@ -58,7 +55,6 @@ def _smooth_in_velocity(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
 
 
 def _body(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
-    """The ten inertial parameters of a body fixed to a link."""
     return link_rows(signals, layout, place, signals.link_regressor(place))
 
 

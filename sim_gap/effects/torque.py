@@ -9,13 +9,14 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
-    CLIPPED,
+    CUT_OFF,
     NEAR_ONE,
     InverseEffect,
     Plausibility,
     SearchHints,
     Shape,
     Signature,
+    Starts,
     delay_effect,
     exceeded_levels,
 )
@@ -39,14 +40,9 @@ def _distorted(distort: Callable[[Array, Shape], Array]) -> Signature:
     return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape), side="distortion")
 
 
-def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]:
+def _shares(*shares: float) -> Starts:
     """Starting levels as shares of the joint's usual largest torque."""
     return lambda signals, place: tuple((share * largest_torque(signals, place),) for share in shares)
-
-
-def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
-    """Levels of the torque [N·m]."""
-    return exceeded_levels(np.concatenate([s.model[:, place] for s in signals]))
 
 
 def _stays_behind(torque: Array, shape: Shape) -> Array:
@@ -56,7 +52,6 @@ def _stays_behind(torque: Array, shape: Shape) -> Array:
 
 
 def is_gradual(shape: Shape) -> bool:
-    """Whether a hysteresis of this shape sets in gradually."""
     return len(shape) > 1
 
 
@@ -81,8 +76,6 @@ def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
-CUT_OFF = Plausibility(prior_mean=1.0, prior_std=CLIPPED, bounds=NEAR_ONE)
-"""Of a level, beyond which all is cut off."""
 EFFECTS = (
     InverseEffect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
@@ -124,7 +117,7 @@ EFFECTS = (
         "torque.saturation",
         _distorted(lambda torque, shape: np.clip(torque, -shape[0], shape[0]) - torque),
         CUT_OFF,
-        SearchHints(shapes_for=_levels),
+        SearchHints(shapes_for=exceeded_levels(lambda s, joint: s.model[:, joint])),
         parameters_of=lambda _, shape, _beneath: [shape[0]],
     ),
     delay_effect("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),

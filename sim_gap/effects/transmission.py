@@ -39,8 +39,7 @@ def _ripple(s: PreparedSignals, joint: int, shape: Shape) -> Array:
 
 def _cycles(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Up to ALWAYS cycles per radian; up to MOST, as far as the joint turns slowly enough during a share SLOWLY of its
-    motion for them to be within the pass band.
-    """
+    motion for them to be within the pass band."""
     speed = np.concatenate([np.abs(s.v[s.moving[:, place] > 0, place]) for s in signals])
     slow = float(np.quantile(speed, SLOWLY)) if len(speed) else np.inf
     shown = 2.0 * np.pi * min(s.band for s in signals) / max(slow, CREEP)
@@ -59,11 +58,8 @@ def _stiffness_and_rest(coefficients: Array, _shape: Shape, _beneath: Beneath) -
 
 
 def _coupling(signals: PreparedSignals, layout: ChannelLayout, place: int, shape: Shape) -> Columns:
-    """The motor of this joint also turns with another joint and has friction and inertia in common with it.
-
-    Motor i turns by q_i + c·q_j. Its friction follows that speed and loads joint j through the same lever c, so that
-    the columns touch both rows: rotor inertia, Coulomb and viscous friction of the shared motor.
-    """
+    """The motor of this joint also turns with another joint, by q_i + c·q_j: its inertia and friction follow that speed
+    and load joint j through the same lever c."""
     other, lever = int(shape[0]) - 1, shape[1]
     speed = signals.v[:, place] + lever * signals.v[:, other]
     push = signals.a[:, place] + lever * signals.a[:, other]

@@ -282,6 +282,12 @@ def urdf_behind(path: Path | None) -> Path | None:
     return source if isinstance(source, Path) and is_urdf(source) else None
 
 
+def links_of_bodies(model: Any, joints: Sequence[int]) -> list[int]:
+    """The link, of those that the joints move, that each body belongs to; −1 for one that none carries."""
+    moved = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
+    return [next((moved[up] for up in upwards(model, body) if up in moved), -1) for body in range(model.nbody)]
+
+
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
     """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
 
@@ -292,16 +298,11 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    link_of_body = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
     frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
-
-    def carrier(body: int) -> int:
-        return next((link_of_body[each] for each in upwards(model, body) if each in link_of_body), -1)
-
-    parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
+    links = links_of_bodies(model, joints)
+    parent = tuple(links[int(model.body_parentid[model.jnt_bodyid[j]])] for j in joints)
     inertial = np.zeros((len(joints), 10))
-    for body in range(1, model.nbody):
-        link = carrier(body)
+    for body, link in enumerate(links):
         if link >= 0:
             own = int(model.jnt_bodyid[joints[link]])
             inertial[link] += fixed_body_parameters(model, data, body, own, model.jnt_pos[joints[link]])

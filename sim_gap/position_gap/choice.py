@@ -135,7 +135,7 @@ def look_about(
     places = [(j, name) for j, name in places if name != "stribeck_velocity" or (j, "stribeck") in fit.free]
     layout = Layout(search, point, places)
     problem = layout.problem(steps)
-    about = linearise(problem, layout.theta(layout.point), range(len(places)))
+    about = linearise(problem, layout.theta, range(len(places)))
     at = {place: k for k, place in enumerate(places)}
     effects: dict[Group, Effect[Group]] = {}
     for group in listed:
@@ -167,10 +167,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
 
 
 def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
-    """Choose effects about the fit and fit them, until the choice stays; the best fit.
-
-    After the first time only those are looked at that were worth their price by themselves or are there.
-    """
+    """Choose effects about the fit and fit them, until the choice stays; the best fit."""
     names = chosen_of(search, fit)
     kept = [each for each in candidates_of(search) if each[0] in search.kept]
     looked = {*names, *unexplained_at(search, fit)}
@@ -200,7 +197,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
     layout = Layout(search, fit.point, fit.free)
-    unlikely = prior_cost(layout.problem(), layout.theta(layout.point), search.data.joints).sum()
+    unlikely = prior_cost(layout.problem(), layout.theta, search.data.joints).sum()
     paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in fit.free)
     return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
 
@@ -269,8 +266,8 @@ OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) 
 """Effects that a controller has that had to be found: damping may be the servo's."""
 
 
-def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
-    return put_back(search, fit, search.places_of(group))
+def without_groups(search: LoopSearch, fit: LoopFit, *groups: Group) -> LoopFit:
+    return put_back(search, fit, [place for group in groups for place in search.places_of(group)])
 
 
 def parts_of(group: Group) -> list[Group]:
@@ -305,25 +302,26 @@ class Stage:
     """Effects that would do as well."""
 
 
-def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, matters: Array) -> list[Stage]:
+def stages(about: About, heldout: Windows, matters: Array) -> list[Stage]:
     """The groups in order of what is lost without each, added to the nominal model and those above them.
 
     `matters` is the gap that counts as one at each joint, (J,) [rad].
     """
+    search, fit = about.search, about.fit
     groups = groups_of(fit, search)
     final, floor = rms_on(heldout, fit.point), search.floor
-    alone = {group: rms_on(heldout, without_group(search, fit, group).point) for group in groups}
+    alone = {group: rms_on(heldout, without_groups(search, fit, group).point) for group in groups}
     order = sorted(groups, key=lambda group: -float(((alone[group] - final) / matters).max()))
     fits = [fit]
     for group in reversed(order):
-        fits.append(without_group(search, fits[-1], group))
+        fits.append(without_groups(search, fits[-1], group))
     known = [final, *(alone[group] for group in order[-1:])]
     courses = [*known, *(rms_on(heldout, each.point) for each in fits[len(known) :])][::-1]
     out = []
     for group, before, after in zip(order, courses[:-1], courses[1:], strict=True):
         falls = [1.0 - np.hypot(b, floor) / np.hypot(a, floor) for a, b in ((before, after), (alone[group], final))]
         share = np.maximum(*falls)
-        loss, rivals = _rivals(search, fit, about, group)
+        loss, rivals = _rivals(about, group)
         out.append(Stage(group, before, after, share, loss, rivals if (share > LEAST_SHRINK).any() else ()))
     return out
 
@@ -332,12 +330,12 @@ ALWAYS = {"controller.dead_zone": ("transmission.backlash",)}
 """Effects that positions alone never separate."""
 
 
-def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tuple[float, tuple[str, ...]]:
+def _rivals(about: About, group: Group) -> tuple[float, tuple[str, ...]]:
     """Loss of the held-out cost with the best other effect in a group's place, and those that lose next to nothing."""
     effect, joints = group
     terms, every = about.terms, about.effects
-    chosen = [part for each in groups_of(fit, search) for part in parts_of(each) if part in every]
-    chosen += [part for part in every if part[0] in search.kept and part not in chosen]
+    chosen = [part for each in groups_of(about.fit, about.search) for part in parts_of(each) if part in every]
+    chosen += [part for part in every if part[0] in about.search.kept and part not in chosen]
     rest = [part for part in chosen if part not in parts_of(group)]
     base = float(terms.cost(about.parameters(chosen)).sum())
 
@@ -347,7 +345,7 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
     whole = least = lost(rest)
     close = list(ALWAYS.get(effect, ()))
     if effect == "controller.stiffness":
-        close += _scale_rivals(search, fit, about, chosen)
+        close += _scale_rivals(about, chosen)
     for other in sorted({id_of(part) for part in every} - {id_of(group)}):
         parts = [part for part in parts_of((other, joints)) if joints and part in every]
         if not parts:
@@ -362,12 +360,12 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
     return max(least, 0.0), tuple(dict.fromkeys(close))
 
 
-def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[Group]) -> tuple[str, ...]:
+def _scale_rivals(about: About, chosen: Sequence[Group]) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if beside a free rotor some joint's gain is loose: positions show ratios."""
     places = about.layout.places
-    for j in range(search.data.joints):
-        rotor = (j, "armature") in places and "actuator.rotor_inertia" not in search.excluded
-        if rotor and (j, "kp") in fit.free:
+    for j in range(about.search.data.joints):
+        rotor = (j, "armature") in places and "actuator.rotor_inertia" not in about.search.excluded
+        if rotor and (j, "kp") in about.fit.free:
             free = about.parameters(chosen) | {places.index((j, "armature"))}
             if about.terms.curvature(np.array([places.index((j, "kp"))]), free)[0, 0] < 1.0 / LOOSE**2:
                 return ("actuator.rotor_inertia",)

@@ -111,7 +111,7 @@ class LoopSearch:
             return fit
         layout = Layout(self, fit.point, fit.free)
         problem = replace(layout.problem(), freedom=freedom)
-        found = solve(problem, layout.theta(layout.point), range(len(fit.free)), iterations)
+        found = solve(problem, layout.theta, range(len(fit.free)), iterations)
         return replace(fit, point=layout.at(found.theta))
 
 
@@ -150,14 +150,11 @@ class Layout:
     def size(self, j: int, name: str) -> float:
         return 1.0 if j < 0 else float(self.search.scales.of(name)[j])
 
-    def theta(self, point: Point) -> Array:
-        """The coordinates of a point, (K,)."""
-        return np.array(
-            [
-                float(point[name][0]) if j < 0 else to_coordinate(name, float(point[name][j]), self.size(j, name))
-                for j, name in self.places
-            ]
-        )
+    @property
+    def theta(self) -> Array:
+        """The coordinates of the point, (K,)."""
+        values = ((j, name, float(self.point[name][max(j, 0)])) for j, name in self.places)
+        return np.array([x if j < 0 else to_coordinate(name, x, self.size(j, name)) for j, name, x in values])
 
     def at(self, theta: Array) -> dict[str, Array]:
         """The point at coordinates (K,)."""
@@ -211,7 +208,7 @@ def jacobian(search: LoopSearch, point: Point, places: Sequence[Place]) -> tuple
     """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) by its own parameters at these places and
     by those of the whole arm, in their own coordinates."""
     data, layout = search.data, Layout(search, point, places)
-    problem, theta = layout.problem(), layout.theta(layout.point)
+    problem, theta = layout.problem(), layout.theta
     at = {place: k for k, place in enumerate(places)}
     parameters = list(problem.parameters)
     for (j, name), k in at.items():

@@ -21,12 +21,12 @@ from sim_gap.position_gap.choice import (
     scale_left,
     select,
     stages,
-    without_group,
+    without_groups,
     worth,
 )
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
 from sim_gap.position_gap.plant import MovedModel, nominal_point
-from sim_gap.position_gap.sound_arm import SoundGap, split_gap
+from sim_gap.position_gap.sound_arm import FRICTION_SHARE, sound_gap
 from sim_gap.position_gap.start import limited_servo_start, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
@@ -41,13 +41,10 @@ from sim_gap.position_gap.training.spread import (
 )
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, windows_of
-from sim_gap.residuals.residual_set import EXPLAINED
+from sim_gap.residuals.residual_set import EXPLAINED, SLIGHT_NM
 
 FITTED, JUDGED = 12, 24
 """Most windows of the fit, and of the judgement."""
-TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
-"""Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
-this share of the tracking error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +64,8 @@ class Identified:
     heldout_before: Array
     heldout_after: Array
     margin: Array
-    sound: SoundGap | None
-    """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
+    sound: bool
+    """Whether a sound arm may have the nominal model's gap; not known if the controller had to be found."""
     moved_train: Array
     """RMS gap of the nominal model that runs free along the training commands [rad]; NaN if the controller had to be
     found, or none is commanded long enough."""
@@ -131,13 +128,13 @@ def identify(
             replay_rms(nominal(sim), some, gain)
             for some, gain in ((train, scale[: len(train)]), (heldout, scale[len(train) :]))
         )
-    search, fit, about = _fitted(search, complete, progress)
+    about = _fitted(search, complete, progress)
+    search, fit = about.search, about.fit
     progress("testing each effect on held-out data")
     margin = _margin(search, fit)
-    split = split_gap(search, judged, margin) if complete else None
-    matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    found = tuple(stages(search, fit, about, judged, matters))
-    before = _bare(search, fit, about, complete)
+    usual, sound = sound_gap(search, judged, margin) if complete else (np.zeros(sim.n), False)
+    found = tuple(stages(about, judged, np.maximum(margin, 2.0 * usual)))
+    before = _bare(search, fit, complete)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
     left = gaps_left_out(data, terms, known_before(search, fit))
@@ -155,7 +152,7 @@ def identify(
         heldout_before=rms_on(judged, before.point),
         heldout_after=rms_on(judged, fit.point),
         margin=margin,
-        sound=split,
+        sound=sound,
         moved_train=moved_train,
         moved_before=moved,
         recordings=tuple(heldout),
@@ -163,11 +160,11 @@ def identify(
     )
 
 
-def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
-    """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
+def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> About:
+    """The fit with the effects that it takes, and all that may be chosen about it; the nominal model as it is where it
+    leaves nothing."""
     if complete and bool(np.all(rms_on(search.data, search.nominal) < QUIET * search.floor)):
-        bare = LoopFit(search.nominal)
-        return search, bare, look_about(search, bare, [])
+        return look_about(search, LoopFit(search.nominal), [])
     search, fit = starting_fit(search, progress)
     best = select(search, fit, progress)
     left, gap = (scale_left(search, point) for point in (best.point, search.nominal))
@@ -178,7 +175,7 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
         other = select(search, limited_servo_start(search, best, unexplained), progress)
         best = max(best, other, key=lambda each: worth(search, each))
     # all candidates: what the start has explained already may have rivals that were not looked at
-    return search, best, look_about(search, best)
+    return look_about(search, best)
 
 
 def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
@@ -206,14 +203,12 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
     return [found[i] / found[0] for i in range(len(labels))]
 
 
-def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> LoopFit:
+def _bare(search: LoopSearch, fit: LoopFit, complete: bool) -> LoopFit:
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
         return LoopFit(own | {"creep": search.data.plant.creep})
-    for group in groups_of(fit, search):
-        fit = without_group(search, fit, group)
-    return search.improve(fit, 4)
+    return search.improve(without_groups(search, fit, *groups_of(fit, search)), 4)
 
 
 def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
@@ -225,7 +220,8 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
 
 
 def _margin(search: LoopSearch, fit: LoopFit) -> Array:
-    """RMS from which it is a gap, per joint (J,) [rad]."""
-    torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
-    matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)
+    """RMS from which it is a gap, per joint (J,) [rad]: torque that matters, at most a share of the joint's, over the
+    gain, at most that share of the tracking error."""
+    torque = np.minimum(SLIGHT_NM, FRICTION_SHARE * search.scales.torque)
+    matters = np.minimum(torque / fit.point["kp"], FRICTION_SHARE * search.scales.angle)
     return np.asarray(np.maximum(2.0 * search.floor, matters))

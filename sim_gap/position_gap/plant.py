@@ -277,7 +277,6 @@ class MovedModel:
         return model
 
     def carried(self) -> list[int]:
-        """Bodies that the arm's joints carry."""
         return carried_bodies(self.model, self.bodies)
 
     def _change_links(self, model: Any, point: Point) -> None:

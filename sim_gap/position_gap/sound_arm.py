@@ -1,12 +1,12 @@
 """Whether a gap is one that a sound arm may have: that of a model whose parameters are known as well as they can be.
 
-Gains, damping, friction, inertia, mass moments and the time of the command of the nominal model are off by a little
-each, with a known standard deviation. Their most probable values given the training recordings say what such errors
-make of the gap; what they leave, and how improbable they are, says whether there is more to it.
+Gains, damping, friction, inertia, mass moments (NOMINAL) and the time of the command of the nominal model are off by a
+little each, with a known standard deviation. Their most probable values given the training recordings say what such
+errors make of the gap; what they leave, and how improbable they are, says whether there is more to it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -14,10 +14,8 @@ from scipy.stats import chi2
 from gcomp.arrays import Array
 from sim_gap.position_gap.fit import Layout, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.windows import Windows
+from sim_gap.search.estimate import NOMINAL
 
-ERROR = 0.01
-"""Relative standard deviation of gains, damping, friction, inertia and mass moments: as much as is known of a good arm,
-and as much as two arms of one build differ."""
 FRICTION_NM, FRICTION_SHARE = 0.02, 0.15
 """Standard deviation of Coulomb friction that models leave out, of bearings and seals [N·m]; at most this share of the
 joint's torque."""
@@ -30,18 +28,6 @@ LEAST_SHOWN = 0.5
 """Least share of its variance by which an error is judged by itself: what shows less takes on what others leave."""
 
 
-@dataclass(frozen=True, eq=False)
-class SoundGap:
-    """The gap of the nominal model beside what small errors of its parameters make, (J,) each [rad]."""
-
-    usual: Array
-    """RMS of the gap that errors of one standard deviation each make together."""
-    left: Array
-    """RMS that remains with the most probable errors, in training or held-out recordings, whichever is more margins."""
-    explained: bool
-    """Whether a sound arm may have these errors, and they leave nothing that matters."""
-
-
 def omitted_of(search: LoopSearch) -> dict[str, Array]:
     """Standard deviation of what sound arms have and models leave out: friction [N·m] and lateness [s], (J,) each."""
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
@@ -52,21 +38,25 @@ def errors_of(search: LoopSearch) -> dict[Place, float]:
     """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
     nominal, scales, omitted = search.nominal, search.scales, omitted_of(search)
     deviation = {
-        "viscous": ERROR * nominal["viscous"],
-        "coulomb": np.hypot(ERROR * nominal["coulomb"], omitted["coulomb"]),
-        "armature": ERROR * scales.inertia,
+        "viscous": NOMINAL * nominal["viscous"],
+        "coulomb": np.hypot(NOMINAL * nominal["coulomb"], omitted["coulomb"]),
+        "armature": NOMINAL * scales.inertia,
         "delay": omitted["delay"],
     }
     out: dict[Place, float] = {}
     for j in range(search.data.joints):
-        out[j, "kp"] = ERROR
+        out[j, "kp"] = NOMINAL
         out |= {(j, name): float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}
-    moments = ERROR * np.linalg.norm(search.arm.inertial[:, 1:4], axis=1)
+    moments = NOMINAL * np.linalg.norm(search.arm.inertial[:, 1:4], axis=1)
     return out | {(-1, f"moment{link}.{axis}"): size for link, size in enumerate(moments.tolist()) for axis in "xyz"}
 
 
-def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
-    """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
+def sound_gap(search: LoopSearch, heldout: Windows, margin: Array) -> tuple[Array, bool]:
+    """RMS of the gap that errors of one standard deviation each make together, (J,) [rad]; and whether small errors
+    explain the nominal model's gap: a sound arm may have the most probable ones, and they leave nothing that matters.
+
+    `margin` is the RMS that counts as a gap at each joint, (J,) [rad].
+    """
     sizes = errors_of(search)
     usually = _correlation(sizes)
     prior = np.linalg.inv(usually)
@@ -79,11 +69,10 @@ def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     spread = np.asarray(np.linalg.inv(normal))
     errors = spread @ right
     layout, other = Layout(search, search.nominal, [*sizes]), replace(search, data=heldout)
-    found = layout.at(layout.theta(layout.point) + np.array([*sizes.values()]) * errors)
+    found = layout.at(layout.theta + np.array([*sizes.values()]) * errors)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
-    explained = all(small) and probable(errors, usually, spread)
-    return SoundGap(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
+    return usual, all(small) and probable(errors, usually, spread)
 
 
 def probable(errors: Array, usually: Array, spread: Array) -> bool:

@@ -77,10 +77,7 @@ def noise_floor(data: Windows) -> Array:
 
 
 def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, LoopFit]:
-    """The search with what rests left out, and a fit of gain, Coulomb and viscous friction at every other joint.
-
-    Where the model has position actuators and moves as the arm does, the fit begins there.
-    """
+    """The search with what rests left out, and a fit of gain, Coulomb and viscous friction at every other joint."""
     progress("fitting gains and friction as a start")
     at_rest, complete = rests(search.data), bool(search.data.plant.driven.all())
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))

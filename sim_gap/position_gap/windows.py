@@ -182,7 +182,6 @@ def _piece(sim: SimModel, part: Recording, given: Array, start: Array, velocity:
 
 
 def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece, list[dict[str, Any]]]:
-    """One piece and its windows."""
     t, q = part.t - part.t[0], part.position
     seen = np.isfinite(q)
     filled = at_times(t, t, q)

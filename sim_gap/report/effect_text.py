@@ -9,7 +9,6 @@ CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd":
 
 
 def advice(answer: Diagnosis) -> str:
-    """Advice to a person, in a sentence."""
     if answer.verdict == "no_gap":
         return "Nothing needs to be changed: the simulator agrees with the arm within the noise of the recordings."
     if answer.verdict == "unexplained":

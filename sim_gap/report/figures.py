@@ -16,10 +16,10 @@ from sim_gap.position_gap.training.export import WRITTEN
 from sim_gap.position_gap.training.replay import (
     Simulated,
     commanded_rows,
+    model_without,
     nominal,
     replay,
     simulated_model,
-    without_groups,
 )
 from sim_gap.report.effect_text import CHANNEL_WORDS
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
@@ -75,7 +75,6 @@ def gap_bars(answer: Diagnosis) -> Any:
 
 
 def rollout_bars(names: tuple[str, ...], rollout: Rollout) -> Any:
-    """Bars per joint: position gap of the forward simulation before and after."""
     title = f"Position gap of the forward simulation over {rollout.horizon_s:.2g} s"
     return _bars(names, rollout.before, rollout.after, "RMS [rad]").update_layout(title=title, height=340)
 
@@ -271,5 +270,5 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     without = {}
     for effect in list(dict.fromkeys(c.effect for c in causes if c.effect in WRITTEN))[: len(COLOURS)]:
         own = [stage.group for stage in found.stages if stage.group[0].partition("@")[0] == effect]
-        without[effect] = moved(without_groups(found.sim, found.search, made, own))[1]
+        without[effect] = moved(model_without(found.sim, found.search, made, own))[1]
     return _over_time(t, found.sim.arm.names, lines, without, "rad")

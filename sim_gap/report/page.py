@@ -31,7 +31,6 @@ PARAMETERS = {
 
 
 def sections(answer: Diagnosis) -> list[Section]:
-    """Sections for a separate page or for a part of another report."""
     out = [_verdict(answer), _gap(answer)]
     if isinstance(answer.internals, Identified):
         out += _motion(answer.internals, answer.causes)
@@ -40,8 +39,8 @@ def sections(answer: Diagnosis) -> list[Section]:
     return out
 
 
-def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", subtitle: str = "") -> None:
-    render(path, title, sections(answer), subtitle)
+def write_report(answer: Diagnosis, path: Path, subtitle: str = "") -> None:
+    render(path, "Sim-to-real gap", sections(answer), subtitle)
 
 
 def _verdict(answer: Diagnosis) -> Section:
@@ -121,7 +120,7 @@ def _motion(found: Identified, causes: Sequence[Cause]) -> list[Section]:
 
 def _over_time(answer: Diagnosis) -> list[Section]:
     layout, out = answer.internals.heldout.layout, []
-    for channel in filter(None, (layout.sensor, layout.motor)):
+    for channel in reversed(layout.chain):
         nominal = (
             "the prediction of the nominal model"
             if channel == layout.against_model
@@ -163,9 +162,8 @@ def _laws(answer: Diagnosis) -> list[Section]:
 def _residuals(answer: Diagnosis) -> list[Section]:
     locations = {(at.channel, at.joint): at for at in answer.where}
     data = answer.internals.heldout
-    channels = [c for c in (data.layout.sensor, data.layout.motor) if c]
     out = []
-    for channel in channels:
+    for channel in reversed(data.layout.chain):
         against = "the model" if channel == data.layout.against_model else "the torque sensor"
         rows = [
             [name, at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"]

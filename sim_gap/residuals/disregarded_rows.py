@@ -16,9 +16,8 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_quality import TIMES_USUAL, Disturbance, spectrum
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.location import Location
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, TRIM_S
-from sim_gap.residuals.residual_set import FEWEST, MOVING_SHARE, ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import FEWEST, MOVING_SHARE, Location, ResidualSet, root_mean_square
 
 LOWEST_PEAK_HZ = 1.5 * BAND_HZ
 """Frequency from which peaks are looked for [Hz]."""

@@ -11,8 +11,9 @@ Row = tuple[str, int]
 """A channel and the index of a joint: one residual over time."""
 Columns = dict[Row, Array]
 """Columns of a linear term at each row that it touches, one per coefficient, (K, p)."""
-DOUBTED, DOUBTED_INNER = 0.01, 0.003
-"""Error granted to the model, and to the friction between motor and sensor, as a share of a joint's torque."""
+FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
+"""Error granted to every arm, and so a residual that is not worth a parameter: share of a joint's torque (RMS) against
+the model, and of motor against sensor or command; and in any case [N·m]."""
 QUIETER = 0.5
 """A noisy motor estimate is passed over if the next reference has less than this share of its uncertainty."""
 
@@ -43,16 +44,12 @@ class ChannelLayout:
     @property
     def against_model(self) -> str:
         """The channel in which errors of links and positions show: the sensor's, else the motor's."""
-        channel = self.sensor or self.motor
-        assert channel is not None
-        return channel
+        return str(self.sensor or self.motor)
 
     @property
     def motor_side(self) -> str:
         """The channel in which friction shows: the motor's, else the sensor's."""
-        channel = self.motor or self.sensor
-        assert channel is not None
-        return channel
+        return str(self.motor or self.sensor)
 
     @property
     def commanded(self) -> str | None:
@@ -94,7 +91,7 @@ class ChannelLayout:
 
 def layout_of(signals: list[PreparedSignals]) -> ChannelLayout:
     """The channels that all recordings have, and the best reference of each joint's command."""
-    common = set.intersection(*(set(s.channels) for s in signals))
+    common = set.intersection(*(set(s.reading) for s in signals))
     sensor = "tau" if "tau" in common else None
     motor = next((channel for channel in ("tau_motor", "tau_cmd") if channel in common), None)
     command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None
@@ -102,9 +99,9 @@ def layout_of(signals: list[PreparedSignals]) -> ChannelLayout:
     if command is None:
         return ChannelLayout(n, sensor, motor)
     torque = np.sqrt(np.mean([np.mean(s.model**2, axis=0) for s in signals], axis=0))
-    doubts = [_noise(signals, "tau_motor"), DOUBTED * torque]
+    doubts = [_noise(signals, "tau_motor"), FLOOR * torque]
     if sensor:
-        doubts.insert(1, np.hypot(_noise(signals, sensor), DOUBTED_INNER * torque))
+        doubts.insert(1, np.hypot(_noise(signals, sensor), FLOOR_INNER * torque))
     doubt = np.array(doubts)
     best = np.argmin(doubt, axis=0)
     clear = doubt[best, np.arange(n)] < QUIETER * doubt[0]

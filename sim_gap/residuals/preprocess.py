@@ -94,10 +94,6 @@ class PreparedSignals:
     def n(self) -> int:
         return int(self.q.shape[1])
 
-    @property
-    def channels(self) -> tuple[str, ...]:
-        return tuple(self.reading)
-
     @cached_property
     def model(self) -> Array:
         """Torque of links and of springs across the joints [N·m], (K, n): the nominal model's, or the estimate's."""
@@ -315,7 +311,7 @@ def _warmth(recording: Recording, times: Array) -> Array | None:
 def _without_stuck(s: PreparedSignals, recording: Recording) -> PreparedSignals:
     """The signals with stuck readings marked as not known."""
     known, found = dict(s.known), []
-    for channel in s.channels:
+    for channel in s.reading:
         values = getattr(recording, CHANNELS[channel])
         for joint in range(s.n):
             there = np.isfinite(values[:, joint])

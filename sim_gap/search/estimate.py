@@ -16,8 +16,8 @@ from sim_gap.search.term import Term, shares_a_factor
 from sim_gap.search.term_equations import TermEquations
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
-"""Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
-at a link, up to WORST."""
+"""Undetected error of a nominal model, as of mass moments, relative: NOMINAL, by which two arms of one build differ, or
+WORSE times the largest error found at a link, up to WORST."""
 SHAPE_STEP = 1e-2
 """Step of the differences in a shape, as a share of it; accuracy to which it is found between its neighbours."""
 LEAST_LEVER_M = 0.01
@@ -92,11 +92,9 @@ class EffectEstimate:
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
         step = SHAPE_STEP * abs(term.shape[i])
-        sides = []
-        for sign in (1.0, -1.0):
-            shape = tuple(s + sign * step * (k == i) for k, s in enumerate(term.shape))
-            sides.append(self.store.columns(Term(term.effect, term.place, shape))[row] @ self.of(term))
-        return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+        moved = (term.reshaped(i, term.shape[i] + d) for d in (step, -step))
+        above, below = (self.store.columns(each)[row] @ self.of(term) for each in moved)
+        return np.asarray((above - below) / (2.0 * step))
 
     @cached_property
     def covariance(self) -> Array:

@@ -14,8 +14,7 @@ from gcomp.arm.inertials import pseudo_inertia
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.exchange import AS_GOOD
-from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate_signals import inertial_change
+from sim_gap.search.column_store import ColumnStore, inertial_change
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
 
@@ -119,11 +118,8 @@ Values = dict[Term, Array]
 def converge(
     nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
 ) -> tuple[ColumnStore, list[Term]]:
-    """Columns of the terms about their own coefficients (`values` of the store), and the terms at their final shapes.
-
-    `nominal` has the columns about the nominal model. `start` holds coefficients to begin with; without it the first
-    step is about the nominal model.
-    """
+    """Columns of the terms about their own coefficients (`values` of the store), and the terms at their final shapes;
+    from the coefficients `start` on, or from the nominal model, which `nominal` has the columns about."""
     terms = [term.start for term in terms]
     values = {term: c for term, c in (start or {}).items() if term in terms}
     best, kept, held = np.inf, values, Values()

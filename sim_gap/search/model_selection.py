@@ -133,11 +133,7 @@ def first_of_each(terms: Sequence[Term]) -> list[Term]:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape, in its best form, to the best fit between its neighbours on the grid.
-
-    A shape at which the term cannot exist is left for one at which it can: a limit fits best where too little is cut
-    off.
-    """
+    """Move each shape, in its best form, to the best fit between its neighbours on the grid."""
     out = list(active)
     for _ in range(3):
         out = relinearised(store, out)

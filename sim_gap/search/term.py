@@ -8,6 +8,7 @@ from gcomp.arrays import Array
 from sim_gap.effects.effect import InverseEffect, Key, Shape
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.preprocess import ABSENT
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,10 @@ class Term:
     def bound(self) -> tuple[int, ...]:
         """Numbers of the recordings that it is present in, from 1; empty if it belongs to the arm."""
         return self.form.signature.recordings(self.shape)
+
+    def present(self, number: int) -> bool:
+        """Whether recording `number` has it: what belongs to the arm is in all of them, a body not in those without."""
+        return not self.form.signature.body if number == ABSENT else not self.bound or number in self.bound
 
     @property
     def start(self) -> "Term":

@@ -94,7 +94,7 @@ def main() -> int:
                 continue
             channels = {"torque": clean.torque + noise[0], "motor_torque": clean.motor_torque + noise[1]}
             recording = replace(clean, **channels)
-            with patch("sim_gap.attribution.answer.roll_out", return_value=None):  # no trend needs it
+            with patch("sim_gap.attribution.diagnose.roll_out", return_value=None):  # no trend needs it
                 found = diagnose(model(), [recording])
             made = found.to_json() | {"watched": watched_parameters(found)}
             answers[case] = made

@@ -23,8 +23,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.attribution.residual_laws import as_effects
-from sim_gap.better_model.corrected_model import HELD
-from sim_gap.better_model.export import write_model
+from sim_gap.better_model.export import HELD, write_model
 from sim_gap.blind.bench import make_apart
 from sim_gap.blind.real_recordings import KNOWN, read_cases, recordings_of
 

@@ -38,7 +38,6 @@ def on_servos(scene: Scene, joints: int | list[int], effect: str, values: Values
 
 
 def delay(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    """A command that arrives late at every joint."""
     return on_servos(scene, list(range(scene.arm.n)), "controller.delay", {"time": float(random.uniform(0.015, 0.06))})
 
 

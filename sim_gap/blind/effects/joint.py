@@ -152,7 +152,6 @@ SIZED = (
 
 
 def crosstalk(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
-    """The reading also follows another joint's torque."""
     size = np.std(scene.torque, axis=0)
     source = int(random.choice(np.flatnonzero(size > 0.4 * size.max())))
     sizes = scene.sensor_level(random) / rms(scene.torque)[source]
@@ -200,7 +199,6 @@ def _on_coulomb(
 
 
 def stribeck(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    """More friction at low speed, in addition to Coulomb friction."""
     j = int(random.integers(scene.arm.n))
     level, speed = float(scene.motor_level(random)[j]), np.abs(scene.motion[1][:, j])
     moving = speed[speed > LEAST_SPEED]

@@ -75,7 +75,6 @@ def _loaded(arm: BenchArm, mass: float, com: Array) -> BenchArm:
 
 
 def tilt(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
-    """The base rotated by a small angle about an axis across gravity."""
     arm = scene.arm
     down = arm.gravity / np.linalg.norm(arm.gravity)
     across = np.cross(down, random.standard_normal(3))

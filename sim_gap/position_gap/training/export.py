@@ -14,12 +14,11 @@ from armlink.model_file import add_actuator
 from armlink.recording.recording import Recording
 from calib.arm.model_files import xml_comment
 from gcomp.arrays import Array, Mask
-from sim_gap.better_model.corrected_model import write_changes
-from sim_gap.better_model.export import CorrectedText
+from sim_gap.better_model.export import HELD, CorrectedText, write_changes
 from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import put_delay
 from sim_gap.model.load import SimModel, named_spec
-from sim_gap.position_gap.choice import id_of, present, without_group
+from sim_gap.position_gap.choice import id_of, present, without_groups
 from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.plant import MovedModel
@@ -56,14 +55,8 @@ NATIVE = {
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
     "actuator.back_emf": "actuator kv",
-    "actuator.rotor_inertia": "joint armature",
-    "friction.coulomb": "joint frictionloss",
-    "friction.viscous": "joint damping",
     "friction.creep": "joint solimpfriction",
-    "transmission.spring": "joint stiffness and springref",
-    "link.payload": "body inertial",
-    "link.mass_moment": "body inertial",
-    "base.tilt": "option gravity",
+    **{name: HELD[name] for name in HELD if name in {*EFFECTS, "link.payload", "link.mass_moment", "base.tilt"}},
 }
 """Effects that a field of MJCF holds."""
 BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
@@ -82,9 +75,7 @@ class Exported(CorrectedText):
 
 def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> LoopFit:
     """The fit with what a simulator holds alone, the rest fitted around it again."""
-    bare = fit
-    for group in _not_held(search, fit, held):
-        bare = without_group(search, bare, group)
+    bare = without_groups(search, fit, *_not_held(search, fit, held))
     share = compensation(search, fit)
     if share is None:
         share = np.full(search.data.joints, search.data.plant.compensated)

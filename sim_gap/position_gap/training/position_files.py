@@ -20,18 +20,16 @@ DELAY_DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
 
 
-def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
+def write_samples(found: Identified, count: int, path: Path) -> None:
     """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
-    write_rows(draw(found.search, found.fit, found.spread, count, seed, found.band.reach), path)
+    write_rows(draw(found.search, found.fit, found.spread, count, reach=found.band.reach), path)
 
 
 def write_exported(found: Identified, path: Path) -> list[str]:
     """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
 
     If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. If it leaves out
-    friction that a module can apply, `NAME_effects.py` is that module, for the model `NAME_effects.xml`. Those of an
-    earlier model are removed where there are none now. URDF has no actuators: theirs are the entries of
-    `--out-actuators`. Raises BadInput.
+    friction that a module can apply, `NAME_effects.py` is that module, for the model `NAME_effects.xml`.
     """
     import mujoco
 

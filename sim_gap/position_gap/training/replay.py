@@ -12,7 +12,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel, silent
-from sim_gap.position_gap.choice import without_group
+from sim_gap.position_gap.choice import without_groups
 from sim_gap.position_gap.fit import Group, LoopSearch
 from sim_gap.position_gap.plant import HeldParts, held_model
 from sim_gap.position_gap.training.export import Exported, export_beside_module
@@ -56,29 +56,25 @@ def simulated_model(sim: SimModel, made: Exported) -> Simulated:
     return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
 
 
-def without_groups(sim: SimModel, search: LoopSearch, made: Exported, groups: Sequence[Group]) -> Simulated:
+def model_without(sim: SimModel, search: LoopSearch, made: Exported, groups: Sequence[Group]) -> Simulated:
     """The written model less some effects, the others as they are."""
-    fit = made.fit
-    for group in groups:
-        fit = without_group(search, fit, group)
+    fit = without_groups(search, made.fit, *groups)
     return simulated_model(sim, export_beside_module(sim, search, fit, fit))
 
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
     """Times (K,), simulated and measured positions (K, n) of the parts of a recording that are commanded without a
-    break; nothing of one without commands.
+    break, for at most `longest` [s] in all.
 
-    Each part begins at its first measured position at rest, under a command that keeps it there (`hold`); each joint's
-    actuator gets the command held from row to row, for at most `longest` [s] in all.
+    Each part begins at its first measured position at rest, under a command that keeps it there (`hold`).
     """
-    rows = commanded_rows(recording, longest)
-    parts = [_replay(arm, slice_rows(recording, part)) for part in rows]
-    if not parts:
-        none = slice_rows(recording, slice(0, 0))
-        return none.t, none.position, none.position
-    moved = np.concatenate(parts)
-    told = np.concatenate([np.arange(len(recording.t))[part] for part in rows])
-    return recording.t[told], moved, recording.position[told]
+    none = recording.position[:0]
+    parts = [(recording.t[:0], none, none)]
+    for rows in commanded_rows(recording, longest):
+        part = slice_rows(recording, rows)
+        parts.append((part.t, _replay(arm, part), part.position))
+    t, moved, measured = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return t, moved, measured
 
 
 def _replay(arm: Simulated, recording: Recording) -> Array:
@@ -158,7 +154,6 @@ def commanded_rows(recording: Recording, longest: float = LONGEST_S) -> list[sli
 
 
 def actuator_of(model: Any, joint: int) -> int:
-    """Number of the actuator that drives a joint."""
     import mujoco
 
     own = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)

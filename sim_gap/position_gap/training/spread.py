@@ -25,6 +25,7 @@ from sim_gap.position_gap.parameters import LOGARITHMIC, PARAMETERS, UNIT, WITH_
 from sim_gap.position_gap.sound_arm import errors_of, omitted_of
 from sim_gap.position_gap.training.unreached_limits import Unreached
 from sim_gap.position_gap.windows import Windows
+from sim_gap.search.estimate import Value
 
 INSIDE = 0.95
 """Probability of an interval."""
@@ -237,7 +238,7 @@ def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> 
 
 def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
     """Change of a parameter's own coordinate per relative change of it, (K,)."""
-    own = Layout(search, fit.point, names).theta(fit.point)
+    own = Layout(search, fit.point, names).theta
     return np.where([name in LOGARITHMIC for _, name in names], 1.0, own)
 
 
@@ -256,44 +257,40 @@ def undecided_scale(fit: LoopFit, spread: Covariance) -> list[int]:
     return [j for j, name in fit.free if name == "kp" and variances[j, name] > LOOSE**2]
 
 
-def interval(
-    search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str
-) -> tuple[float, float, float, str]:
-    """Value, ends of its 95 % interval, and unit; of a limit that no motion reaches, where it may lie."""
+def interval(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str) -> Value:
+    """A parameter and its 95 % interval; of a limit that no motion reaches, where it may lie."""
     for limit in spread.limits:
         if (limit.joint, limit.name) == (joint, name):
             value = float(fit.point[name][joint])
-            return value, limit.least, max(limit.most, value), PARAMETERS[name].unit
+            return Value(value, limit.least, max(limit.most, value), PARAMETERS[name].unit)
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
     half = min(half, ANYTHING) if name in LOGARITHMIC else half
     layout = Layout(search, fit.point, [(joint, name)])
-    problem, about = layout.problem(), layout.theta(fit.point)
+    problem, about = layout.problem(), layout.theta
     points = [fit.point, *(layout.at(problem.within(about + step)) for step in (-half, half))]
     value, *ends = (float(point[name][max(joint, 0)]) for point in points)
     unit = PARAMETERS[name].unit if joint >= 0 else UNIT[name.partition(".")[2]]
-    return value, min(ends), max(ends), unit
+    return Value(value, min(ends), max(ends), unit)
 
 
-def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> tuple[float, float, float, str]:
-    """A coordinate of a payload's centre of mass, from its mass moment: value, ends of its 95 % interval, unit."""
+def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> Value:
+    """A coordinate of a payload's centre of mass, from its mass moment."""
     mass, moment = (float(fit.point[name][0]) for name in ("payload.mass", column))
     divisor = float(np.copysign(max(abs(mass), LIGHT_KG), mass))
     centre, change = moment / divisor, np.zeros(len(spread.names))
     change[spread.names.index((-1, column))] = 1.0 / divisor
     change[spread.names.index((-1, "payload.mass"))] = -centre / divisor
     half = 2.0 * float(np.sqrt(change @ spread.matrix @ change))
-    return centre, centre - half, centre + half, "m"
+    return Value(centre, centre - half, centre + half, "m")
 
 
 def draw(
     search: LoopSearch, fit: LoopFit, spread: Covariance, count: int, seed: int = 0, reach: Array | None = None
 ) -> list[dict[str, float]]:
     """Draws of all parameters from their joint distribution, within their bounds, and of the limits that no recording
-    reaches: `joint.name` → value.
-
-    The distribution is one of small steps. A draw whose motion is further from the fit's than `reach` (J,) [rad], RMS
-    over the training motion to first order, is shortened.
+    reaches: `joint.name` → value. One whose training motion is further from the fit's than `reach` (J,) [rad, RMS], to
+    first order, is shortened, for the distribution is one of small steps.
     """
     random = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(spread.matrix)
@@ -302,7 +299,7 @@ def draw(
     if reach is not None:
         steps = _within(search, fit, spread, steps, reach)
     layout = Layout(search, fit.point, spread.names)
-    problem, about = layout.problem(), layout.theta(layout.point)
+    problem, about = layout.problem(), layout.theta
     points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
     for each in spread.limits:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
+from gcomp.estimate.choice import SIGNIFICANT
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 
 HEADROOM = 10.0
@@ -19,7 +20,7 @@ and all of what a drive can do."""
 ABOVE = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """Levels that are tried, over what the training motion asks for: commands are held from row to row, so that a limit of
 their speed shows far above it."""
-COSTS = 2.0
+COSTS = 0.5 * SIGNIFICANT**2
 """Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
 LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
 """Parameter that is a limit → its effect."""
@@ -77,7 +78,9 @@ def _torques(search: LoopSearch, fit: LoopFit) -> Array:
     error = data.error - residuals(data, [point])[0]
     kp, inner = (point[name][:, None] for name in ("kp", "kv"))
     damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
-    return _highest(search, np.abs(kp * error * data.scale - damping * data.v))
+    counted = data.weight * data.served > 0.0
+    asked = np.where(counted, np.abs(kp * error * data.scale - damping * data.v), 0.0)
+    return np.asarray(asked.max(axis=(0, 2)))
 
 
 def _command_speeds(search: LoopSearch) -> Array:
@@ -90,13 +93,6 @@ def _command_speeds(search: LoopSearch) -> Array:
             speed = np.abs(np.diff(held, axis=0)) / np.diff(piece.ends[:-1])[:, None]
             out = np.maximum(out, speed.max(axis=0))
     return out
-
-
-def _highest(search: LoopSearch, values: Array) -> Array:
-    counted = search.data.weight * search.data.served > 0.0
-    return np.array(
-        [float(values[:, j][counted[:, j]].max()) if counted[:, j].any() else 0.0 for j in range(search.data.joints)]
-    )
 
 
 def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:

@@ -8,13 +8,12 @@ import pytest
 from sim_gap.attribution import notes, rollout
 from sim_gap.attribution.causes import order_of_effects
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.attribution.position_answer import _where
-from sim_gap.attribution.position_notes import running_free
+from sim_gap.attribution.position_answer import _where, running_free
 from sim_gap.attribution.residual_laws import ResidualLaw, _LawCandidate
 from sim_gap.attribution.rollout import RollOuts
 from sim_gap.better_model.export import _line
 from sim_gap.residuals.layout import ChannelLayout
-from sim_gap.residuals.location import Location, _features
+from sim_gap.residuals.residual_set import Location, _features
 from sim_gap.search.estimate import Value
 from sim_gap.search.term import Term
 

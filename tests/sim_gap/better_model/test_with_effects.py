@@ -10,8 +10,7 @@ from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.corrected_model import add_motors
-from sim_gap.better_model.export import write_model
+from sim_gap.better_model.export import add_motors, write_model
 from sim_gap.model.load import load_model, tendons_of
 
 CASES = {

@@ -6,7 +6,7 @@ import pytest
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.joints import match_joints
+from sim_gap.checks.check import match_joints
 
 MODEL = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint")
 

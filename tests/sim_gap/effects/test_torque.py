@@ -9,8 +9,6 @@ from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.better_model import forward_effects
-from sim_gap.effects import torque
 
 WIDTH = 0.8
 
@@ -58,7 +56,3 @@ def test_a_dead_band_gets_what_the_hysteresis_passes_on():
     assert set(found) == {"torque.hysteresis", "torque.deadband"}
     assert found["torque.deadband"]["width"].value == pytest.approx(band, rel=0.03)
     assert found["torque.hysteresis"]["width"].value == pytest.approx(width, rel=0.05)
-
-
-def test_the_written_module_has_the_same_plays():
-    assert forward_effects.GRADUAL == torque.GRADUAL

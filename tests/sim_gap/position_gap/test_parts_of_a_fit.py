@@ -44,7 +44,7 @@ def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -
     names = ("tilt.x", "tilt.y", "z")
     fit = LoopFit({name: np.array([0.3]) for name in (*names, "kp")}, tuple((-1, name) for name in names))
     arm = SimpleNamespace(plant=SimpleNamespace(sim=SimpleNamespace(arm=None)))
-    bare = edits.without_group(fitting.LoopSearch(arm, None, {}, np.zeros(1)), fit, ("base.tilt", ()))
+    bare = edits.without_groups(fitting.LoopSearch(arm, None, {}, np.zeros(1)), fit, ("base.tilt", ()))
     assert {name: float(x[0]) for name, x in bare.point.items()} == {"z": 0.3, "kp": 0.3}
     assert bare.free == ((-1, "z"),)
 

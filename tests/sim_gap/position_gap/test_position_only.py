@@ -13,8 +13,7 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.position_answer import _lowers, _verdict
-from sim_gap.attribution.position_notes import _beyond, _faster, _released
+from sim_gap.attribution.position_answer import _beyond, _faster, _lowers, _released, _verdict
 from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.export import export_with_module
@@ -59,12 +58,12 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
 
     def verdict(
         *gaps: float,
-        sound: SimpleNamespace | None = None,
+        sound: bool | None = None,
         moved: tuple[Sequence[float], Sequence[float]] | None = None,
         left: float | None = None,
     ) -> str:
         gap, search = np.array(gaps), SimpleNamespace(open_controller=sound is None)
-        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, search=search, train_before=gap)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=bool(sound), search=search, train_before=gap)
         found.moved_train, found.moved_before = np.array(moved if moved is not None else np.full((2, 2), np.nan))
         found.heldout_before, found.heldout_after, found.train_after = gap, 0.1 * gap, (left or 0.1) * gap
         causes = [SimpleNamespace(confounded_with=(), confidence=0.75)] if left is None else []
@@ -72,8 +71,8 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
 
     assert verdict(0.00009, 0.00008) == "no_gap"
     assert verdict(0.0010, 0.0018) == "explained"
-    assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=False)) == "explained"
-    assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=True)) == "no_gap"
+    assert verdict(0.0010, 0.0018, sound=False) == "explained"
+    assert verdict(0.0010, 0.0018, sound=True) == "no_gap"
     assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [8e-5, 7e-5])) == "no_gap"
     assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [8e-5, 2e-4])) == "explained"
     assert verdict(0.0010, 0.0018, moved=([5e-5, 2e-4], [8e-5, 7e-5])) == "explained"

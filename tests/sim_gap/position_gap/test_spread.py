@@ -19,6 +19,7 @@ from sim_gap.position_gap.training.spread import (
     jackknifed,
     terms_of,
 )
+from sim_gap.search.estimate import NOMINAL
 
 FRICTION = 0.15, 0.35
 
@@ -46,12 +47,12 @@ def test_an_interval_holds_what_other_recordings_of_the_arm_show(several) -> Non
     """The arm is warm in half of them: noise within a recording says nothing of that."""
     search, fit = several
     for joint in (0, 1):
-        _, low, high, _ = interval(search, fit, covariance(search, fit), joint, "coulomb")
-        assert low < FRICTION[0]
-        assert FRICTION[1] < high
-        _, own_low, own_high, _ = interval(search, fit, within(search, fit), joint, "coulomb")
-        assert FRICTION[0] < own_low
-        assert own_high < FRICTION[1]
+        found = interval(search, fit, covariance(search, fit), joint, "coulomb")
+        assert found.low < FRICTION[0]
+        assert FRICTION[1] < found.high
+        own = interval(search, fit, within(search, fit), joint, "coulomb")
+        assert FRICTION[0] < own.low
+        assert own.high < FRICTION[1]
 
 
 @pytest.mark.long
@@ -142,10 +143,10 @@ def test_of_a_payload_the_centre_is_told_and_not_the_moment() -> None:
     """Of 0.4 ± 0.02 kg and 0.08 ± 0.002 kg·m independent of it: 0.2 m, and relative deviations add in squares."""
     fit = LoopFit({"payload.mass": np.array([0.4]), "payload.x": np.array([0.08])})
     found = Covariance([(-1, "payload.mass"), (-1, "payload.x")], np.diag([0.02**2, 0.002**2]))
-    centre, low, high, unit = spread.payload_centre(fit, found, "payload.x")
-    assert (centre, unit) == (pytest.approx(0.2), "m")
-    assert high - centre == pytest.approx(centre - low)
-    assert high - centre == pytest.approx(2.0 * 0.2 * np.hypot(0.05, 0.025))
+    centre = spread.payload_centre(fit, found, "payload.x")
+    assert (centre.value, centre.unit) == (pytest.approx(0.2), "m")
+    assert centre.high - centre.value == pytest.approx(centre.value - centre.low)
+    assert centre.high - centre.value == pytest.approx(2.0 * 0.2 * np.hypot(0.05, 0.025))
 
 
 def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
@@ -157,7 +158,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     assert [name for j, name in found.names if j < 0] == list(names)
     own = float(np.linalg.norm(search.data.plant.sim.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
-    assert np.sqrt(found.matrix[at, at]) > 0.9 * sound_arm.ERROR * own
+    assert np.sqrt(found.matrix[at, at]) > 0.9 * NOMINAL * own
 
 
 def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several) -> None:
@@ -167,5 +168,5 @@ def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several)
     for joint in (0, 1):
         wide, own = covariance(search, some), within(search, some)
         assert deviations(wide, "coulomb")[joint] > deviations(own, "coulomb")[joint]
-        _, low, high, _ = interval(search, some, wide, joint, "coulomb")
-        assert low < float(fit.point["coulomb"][joint]) < high
+        found = interval(search, some, wide, joint, "coulomb")
+        assert found.low < float(fit.point["coulomb"][joint]) < found.high

@@ -10,7 +10,7 @@ import pytest
 from servo_arm import at_both, model_text, record, search_on, written
 
 from armlink.recording.recording import Recording
-from sim_gap.attribution.position_notes import _ranges
+from sim_gap.attribution.position_answer import _ranges
 from sim_gap.better_model.export import module_text
 from sim_gap.model.load import SimModel, load_model
 from sim_gap.position_gap.fit import LoopFit, LoopSearch

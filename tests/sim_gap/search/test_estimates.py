@@ -9,13 +9,12 @@ from wrong_arms import Wrong, model, record
 
 from gcomp.arm.inertials import point_mass
 from sim_gap.model.load import load_model
-from sim_gap.residuals.layout import layout_of
+from sim_gap.residuals.layout import FLOOR, FLOOR_INNER, layout_of
 from sim_gap.residuals.preprocess import prepare
-from sim_gap.residuals.residual_set import FLOOR, FLOOR_INNER, ResidualSet
+from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search import gauss_newton, model_selection
-from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.column_store import ColumnStore, signals_about
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.estimate_signals import signals_about
 from sim_gap.search.gauss_newton import _closest, _positive, _shapes
 from sim_gap.search.model_selection import relinearised_in_place, select_model
 from sim_gap.search.term import Term
