@@ -175,9 +175,7 @@ def _plan(
         answer |= {"seconds": took, "collisions": checked}
         told = f"about {_minutes(took)} for the pass {_load(reference_mass)}"
         if check_stops:
-            told += (
-                f", {_minutes(stops_seconds(arm_file))} more before it, to push every joint onto its stops"
-            )
+            told += f", {_minutes(stops_seconds(arm_file))} more before it, to push every joint onto its stops"
         told += f"; {checked}{drawn}"
         if not reference_mass:
             told += "; the pass begins with a rough gravity model, and may then take other poses, which are checked too"
