@@ -206,7 +206,7 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
     if isinstance(fit, SensorFit):
         columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
         doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-        told = "expected difference of sensors and gravity model at new poses, beside noise and these intervals"
+        told = "expected difference of sensors and gravity model at new poses, in addition to noise and these intervals"
         lines.append(f"{told} [N·m]: {', '.join(doubts)}")
         lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
         if fit.gain_ratio is not None:

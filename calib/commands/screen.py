@@ -104,7 +104,7 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(f"{motion}. {question}")
         return []
-    return [f"{motion}. {question} Without a terminal nobody is asked, and the arm moves now"]
+    return [f"{motion}. {question} There is no terminal to ask on: the arm moves now"]
 
 
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:

@@ -122,7 +122,7 @@ def unit_doubt(services: NodeServices, joint: LinkJoint) -> str:
     return (
         f"{joint.name} ({joint.settings.address}): drive.position_unit is {given / own:.3g} times the unit that 6092h, "
         f"60A8h or 608Fh of the device give; if position_unit is wrong, the joint turns {own / given:.3g} times as "
-        "fast and as far as it reads: before anything else, run `armlink check ARM --scales hand`"
+        "fast and as far as its readings say: before anything else, run `armlink check ARM --scales hand`"
     )
 
 

@@ -66,7 +66,7 @@ def rewire(
         text = f"{yaml_comment(title)}\n{text}"
     arm = parse_arm(parse_yaml(text, out), out)
     write_whole(out, text)
-    where = "each at the joint that has its id in the file" if by_ids else "in the order of their ids, as assumed"
+    where = "each at the joint with the same id in the file" if by_ids else "in the order of their ids, as assumed"
     more = "" if all(each.by_hand for each in matches) else f", {where}: --by-hand checks it"
     return _tell(out, arm, matches, more, findings + doubts, json)
 

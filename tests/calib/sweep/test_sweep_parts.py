@@ -287,7 +287,7 @@ def test_without_a_terminal_it_is_said_what_moves_and_that_nobody_is_asked(
 ) -> None:
     monkeypatch.setattr("sys.stdin", None)
     (said,) = confirm("bench will move", "Is its space clear?")
-    assert said == "bench will move. Is its space clear? Without a terminal nobody is asked, and the arm moves now"
+    assert said == "bench will move. Is its space clear? There is no terminal to ask on: the arm moves now"
 
 
 def swept(folder: Path, mass: float, seconds: int, speed: float | None = None) -> SweepData:
