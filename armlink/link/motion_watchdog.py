@@ -40,7 +40,8 @@ FILTER_TIME = 0.01
 """A drive's own filter delays its velocity by so much [s]; that of the simulated nodes by 0.008."""
 TOLD_TIME = 0.004
 """A velocity tells of so much of the motion before it [s]: a cycle at 250 Hz, within which a drive hardly changes its
-speed. In a longer one, joints swing in time with the steps of their targets, and each velocity meets the same phase."""
+speed. In a longer one, joints swing in time with the steps of their targets, and each velocity meets the same phase: of
+the rest of that cycle it may have claimed too much, but a velocity of 0 has claimed nothing."""
 IDLE_SHARE = 0.25
 """Slower than this share of max_velocity a joint proves no speed that any limit asks for."""
 
@@ -48,8 +49,8 @@ IDLE_SHARE = 0.25
 class _Joint:
     """The newest readings of one joint, and what they prove."""
 
-    __slots__ = ("age", "apart", "at", "before", "earliest", "latest", "most", "newest", "peak",
-                 "positions", "steady", "step", "time", "told", "unseen", "way", "width")  # fmt: skip
+    __slots__ = ("age", "apart", "at", "before", "claimed", "earliest", "latest", "most", "newest", "peak",
+                 "positions", "steady", "step", "time", "told", "way", "width")  # fmt: skip
 
     def __init__(self, step: float, most: float, rows: int) -> None:
         """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the readings are kept."""
@@ -64,10 +65,10 @@ class _Joint:
         too, since a joint that strikes its stop turns round between two of them."""
         self.before = self.time = math.nan
         """Newest position, and the middle of the time in which it was taken."""
-        self.apart = self.way = self.unseen = self.peak = self.width = self.age = 0.0
-        """Way by positions less that by velocities, way of the two together, way that the velocities leave open [rad];
-        greatest speed [rad/s]; longest time in which a sample was taken, greatest age of a velocity [s]. All fade with
-        MEMORY."""
+        self.apart = self.way = self.claimed = self.peak = self.width = self.age = 0.0
+        """Way by positions less that by velocities, way of the two together, way that velocities claimed for the part
+        of a cycle of which they do not tell [rad]; greatest speed [rad/s]; longest time in which a sample was taken,
+        greatest age of a velocity [s]. All fade with MEMORY."""
 
 
 class MotionWatch:
@@ -142,7 +143,7 @@ class MotionWatch:
         told_before, own.told = own.told, speed if age <= delay else 0.0
         unseen = told_before > most and (1 - SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
         oldest = own.age if own.age > delay else delay
-        explained = WAY + 2 * own.step + SHARE * own.way + own.unseen + (oldest + own.width) * own.peak
+        explained = WAY + 2 * own.step + SHARE * own.way + own.claimed + (oldest + own.width) * own.peak
         return proven, ahead, unseen or abs(own.apart) > explained
 
     def _extrapolated(self, own: _Joint, here: float, since: float, until: float) -> float:
@@ -175,7 +176,7 @@ class MotionWatch:
         keep, new, middle = 1.0, here == here, (since + until) / 2
         elapsed = middle - own.time if new else math.nan
         if elapsed > self._delay + self._period:  # in which the velocity may have been anything
-            keep, own.apart, own.way, own.unseen = 0.0, 0.0, 0.0, 0.0
+            keep, own.apart, own.way, own.claimed = 0.0, 0.0, 0.0, 0.0
         else:
             moved, turned = here - own.before, told * elapsed
             if moved - turned == moved - turned:  # neither is NaN
@@ -185,8 +186,8 @@ class MotionWatch:
                 own.apart = keep * own.apart + moved - turned
                 far, wide = abs(moved), abs(turned)
                 own.way = keep * own.way + (wide if wide > far else far)
-                untold = elapsed - TOLD_TIME
-                own.unseen = keep * own.unseen + (untold * speed if untold > 0.0 else 0.0)
+                rest = elapsed - TOLD_TIME
+                own.claimed = keep * own.claimed + (rest * abs(told) if rest > 0.0 else 0.0)
         peak, oldest = keep * own.peak, keep * own.age
         own.peak, own.age = speed if speed > peak else peak, age if age > oldest else oldest
         if new:

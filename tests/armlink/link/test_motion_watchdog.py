@@ -1,12 +1,14 @@
 """What readings prove about the motion of a joint, and what they do not: nothing is put down to a drive that a late
 host, a late reply or a lost frame explains."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from armlink.link.bus_watchdog import EXCESS, SLOW_CYCLES, BusWatch
+from armlink.link.bus_watchdog import CROWD, CROWD_PER_JOINT, CROWDED_CYCLES, EXCESS, SLOW_CYCLES, BusWatch
 from armlink.link.motion_watchdog import MotionWatch
 
 PERIOD, MOST = 0.004, 1.0
@@ -166,6 +168,47 @@ def test_a_joint_that_swings_in_time_with_slow_cycles_is_not_contradicted(rate: 
         watch.update([0.01 * t], [t], [t], [-0.13], [t])
         found = found or watch.contradicted[0]
     assert found == contradicted
+
+
+@pytest.mark.parametrize("rate", [250.0, 50.0])
+@pytest.mark.parametrize("factor", [0.0, -1.0])
+def test_a_velocity_that_is_stuck_or_reversed_is_contradicted_at_any_rate(rate: float, factor: float) -> None:
+    watch, noticed = MotionWatch(1, 1 / rate), math.inf
+    watch.use(np.array([1e-4]), np.array([1.0]))
+    for cycle in range(round(2 * rate)):
+        t = cycle / rate
+        speed = min(t, 0.8)
+        watch.update([t**2 / 2 if t < 0.8 else 0.8 * t - 0.32], [t], [t], [factor * speed], [t])
+        if watch.contradicted[0]:
+            noticed = t
+            break
+    assert noticed < 1.0
+
+
+@pytest.mark.parametrize("rate", [250.0, 50.0])
+def test_a_sound_joint_that_swings_is_not_contradicted(rate: float) -> None:
+    """A swing of its own beside the one in time with the cycles, whose phase the velocity meets at 50 Hz."""
+    watch, ripple = MotionWatch(1, 1 / rate), 0.1 if rate < 100 else 0.0
+    watch.use(np.array([1e-4]), np.array([1.0]))
+    for cycle in range(round(6 * rate)):
+        t = cycle / rate
+        velocity = 0.8 * np.cos(2.0 * t) + ripple * np.cos(2 * np.pi * 50.0 * t)
+        watch.update([0.4 * np.sin(2.0 * t)], [t], [t], [velocity], [t])
+        assert not watch.contradicted[0]
+
+
+def test_a_late_host_gets_the_frames_of_the_time_that_it_took() -> None:
+    """The limit of frames is one of time: what a drive sends by its own clock comes whether the host is late or not."""
+    for periods in (1.0, 4.0, 10.0):
+        bus = BusWatch(1)
+        most = round(periods * (CROWD_PER_JOINT + CROWD))
+        for _ in range(2 * CROWDED_CYCLES):
+            bus.cycle_ends(most, periods)
+            assert not bus.babbling
+        for _ in range(CROWDED_CYCLES):
+            assert not bus.babbling
+            bus.cycle_ends(most + 1, periods)
+        assert bus.babbling
 
 
 def test_answers_to_other_requests_do_not_make_readings_that_catch_up_a_second_node():
