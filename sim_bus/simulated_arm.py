@@ -151,7 +151,7 @@ class SimulatedArm:
         A cycle that is a little late is one step: a short one after it would sample the torque at another phase.
         """
         remaining = duration
-        piece = duration / max(1, round(duration / self.period))
+        piece = duration / max(1, round(duration / self._longest_step))
         while remaining > 1e-9:
             for drive in self.drive_at.values():
                 drive.control(piece)
@@ -216,6 +216,12 @@ class SimulatedArm:
     def operational(self) -> bool:
         """Whether any node is operational and thus reacts to SYNC."""
         return any(self._operational)
+
+    @property
+    def _longest_step(self) -> float:
+        """A SYNC period, or the shorter period in which a drive sends by its own clock [s]: to a slow host it sends
+        several times a cycle."""
+        return min([self.period, *(drive.own_period for drive in self.drive_at.values())])
 
     # ---- truth, hidden from any fit
 

@@ -26,9 +26,9 @@ TORQUE_MEMORY = 10
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
-    def __init__(self, joints: int, own_clock: float = 0.0) -> None:
-        """`own_clock`: the period of a cycle [s] where drives send by their own clock."""
-        self._crowd = CROWD_PER_JOINT * joints * max(1.0, OWN_RATE * own_clock) + CROWD
+    def __init__(self, joints: int, sends: float = 1.0) -> None:
+        """`sends`: how often a drive sends in a cycle at most; more than once where its own clock is faster."""
+        self._crowd = CROWD_PER_JOINT * joints * sends + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._slow_readings = [0] * joints

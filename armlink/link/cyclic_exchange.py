@@ -17,7 +17,7 @@ from armlink.drives.base import ANY
 from armlink.drives.board import Board, DriveEvent
 from armlink.drives.orders import Order, Power, Reading, law_torque, power_code
 from armlink.errors import BusFault, HostLate, Refused
-from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
+from armlink.link.bus_watchdog import MOST_FRAMES, OWN_RATE, BusWatch
 from armlink.link.gate import EXACT
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
@@ -51,7 +51,7 @@ class Loop:
         self.board = board = Board(self.n)
         traits = traits_of(self.groups)
         cadences = {each.cadence for each in traits}
-        self.watch = BusWatch(self.n, period if "cyclic" in cadences else 0.0)
+        self.watch = BusWatch(self.n, max(1.0, OWN_RATE * period) if "cyclic" in cadences else 1.0)
         board.on_again, board.on_slow = self.watch.again, self.watch.slow
         board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
@@ -67,8 +67,11 @@ class Loop:
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
         self._rest = 0.0
         """Time from the commands until it looks for replies [s]."""
-        self.woke = self._drained = -math.inf
+        self.woke = -math.inf
         """When it last began to take in replies that nobody waited for, by the clock [s]."""
+        self._drained = -math.inf
+        """When it last had taken in all that came between cycles, by the clock [s]: a cycle, whose frames the watch
+        counts, goes from one such instant to the next."""
         self.just_woke = False
         """Whether that was after the last commands."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None

@@ -31,6 +31,8 @@ class SimulatedDrive:
         self._send = send
         self._cyclic: dict[int, tuple[float, float]] = {}
         """Period and next instant of each frame that it sends by its own clock [s]."""
+        self.own_period = math.inf
+        """Shortest of these periods in force [s]; infinite where it sends nothing by its own clock."""
 
     # ---- bus
 
@@ -114,6 +116,7 @@ class SimulatedDrive:
     def send_every(self, period: float, frame: int, first: float = 0.0) -> None:
         """Send a frame each `period` from the instant `first` on [s], by send_cyclic(); never where it is infinite."""
         self._cyclic[frame] = (period, first)
+        self.own_period = min([each for each, instant in self._cyclic.values() if instant < math.inf], default=math.inf)
 
     def send_cyclic(self, frame: int) -> None:
         raise NotImplementedError

@@ -41,7 +41,7 @@ SHORT = {"motion": "steps", "steps": 5, "poses": 1, "loaded_poses": 1, "hold": "
 ASKED = re.compile(
     r"(\S+): (?:now )?turn (?:this joint by hand|it) to its (?:lower|upper)\s+stop\s+\(([-+]\d+\.\d+)\s+rad\)"
 )
-LOWEST = 50.0
+LOWEST = 25.0
 """Rate that is tried at least [Hz]: the kernel of `scripts/with-vcan` has one emulated processor for arm and host."""
 STARTED, ENDED = 20.0, 900.0
 """Seconds within which the simulated arm stands on the bus and a command ends."""

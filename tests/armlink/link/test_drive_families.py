@@ -6,6 +6,7 @@ import pytest
 from armlink.arm_file import load_arm
 from armlink.drives.orders import Power
 from armlink.errors import BadInput
+from armlink.link.bus_watchdog import CROWD_PER_JOINT
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
 from sim_bus.bus.lock_step import LockStepBus
@@ -43,7 +44,12 @@ def test_what_drives_send_by_their_own_clock_is_no_flood_to_a_slow_host(name):
     arm = arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 25.0})})
     with Link(arm, LockStepBus(arm=SimulatedArm(arm, Truth.of(arm), 0))) as link:
         link.start()
-        hold(link, Command.hold(link.enable().position), 50)
+        command = Command.hold(link.enable().position)
+        hold(link, command, 10)
+        before = link.stats.frames
+        hold(link, command, 50)
+        each = (link.stats.frames - before) / (50 * link.n)
+        assert each > CROWD_PER_JOINT if name == "six-piper" else each <= CROWD_PER_JOINT
         link.disable()
 
 
