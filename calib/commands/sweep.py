@@ -129,6 +129,8 @@ def sweep(
             if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
                 pushed = partial(screen.count, what="stops, each touched by its joint")
                 found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
+                for line in found.left_out:
+                    screen.say(line)
             data = run_sweep(
                 link,
                 arm_file,

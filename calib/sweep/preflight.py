@@ -3,7 +3,7 @@
 A drive that gets too hot later says so by an emergency, which ends any sweep.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -49,6 +49,8 @@ class Preflight:
     """Stops by the arm file (n, 2) [rad]."""
     temperature: Array
     """Of the drives (n,) [°C]; NaN where a drive does not report it."""
+    left_out: tuple[str, ...] = ()
+    """What was not pushed although it was to be, and why: a sentence for each reason, with side and joint."""
 
 
 def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
@@ -136,13 +138,13 @@ def find_stops(
     """Push each joint slowly onto both its stops, no harder than its position loop does 15 mrad off, others mid-range.
 
     Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
-    does not get to, or on whose way bodies of the model touch, is left out.
+    does not get to, or on whose way bodies of the model touch, is left out, and `left_out` names it.
     """
     limits, planned = DriveLimits.of(arm), PlannedArm(arm)
     mover = Mover(link, planned.section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2
-    stops = np.full((link.n, 2), np.nan)
+    stops, touching, unreached = np.full((link.n, 2), np.nan), list[str](), list[str]()
     for count, joint in enumerate(reversed(range(link.n))):
         for end, side in enumerate((-1, 1)):
             goal, here = middle.copy(), mover.command.position.copy()
@@ -151,24 +153,41 @@ def find_stops(
             at_stop[joint] = limits.lower[joint] if side < 0 else limits.upper[joint]
             ways = ([here, goal, at_stop], [here, middle, goal, at_stop])
             way = next((each for each in ways if all(planned.is_clear(*leg) for leg in pairwise(each))), None)
+            name = f"the {'lower' if side < 0 else 'upper'} stop of {link.names[joint]}"
             if way is None:
-                continue
-            try:
-                for pose in way[1:-1]:
-                    mover.travel(pose, 1.0)
-                push = np.zeros(link.n, dtype=np.int64)
-                push[joint] = side
-                stops[joint, end] = mover.touch(push)[joint]
-                mover.hold_all()
-                mover.travel(goal, 1.0)
-            except Stalled:  # too heavy to hold there: the sweeps, which know the weight, look again
-                mover.hold_all()
-                mover.travel(middle, 1.0)
+                touching.append(name)
+            else:
+                try:
+                    for pose in way[1:-1]:
+                        mover.travel(pose, 1.0)
+                    push = np.zeros(link.n, dtype=np.int64)
+                    push[joint] = side
+                    stops[joint, end] = mover.touch(push)[joint]
+                    mover.hold_all()
+                    mover.travel(goal, 1.0)
+                except Stalled:  # too heavy to hold there: the sweeps, which know the weight, look again
+                    if np.isnan(stops[joint, end]):
+                        unreached.append(name)
+                    mover.hold_all()
+                    _travel_if_clear(mover, planned, middle)
             if report is not None:
                 report(2 * count + end + 1, 2 * link.n)
-    if planned.is_clear(mover.command.position, middle):
-        mover.travel(middle, 1.0)
-    return replace(found, stops=stops)
+    _travel_if_clear(mover, planned, middle)
+    return replace(found, stops=stops, left_out=tuple(_left_out(touching, unreached)))
+
+
+def _travel_if_clear(mover: Mover, planned: PlannedArm, goal: Array) -> None:
+    """Go straight to a pose (n,) [rad], or stay where the model's shapes are in the way."""
+    if planned.is_clear(mover.command.position, goal):
+        mover.travel(goal, 1.0)
+
+
+def _left_out(touching: Sequence[str], unreached: Sequence[str]) -> Iterator[str]:
+    """Sentences on the stops that were not pushed."""
+    if touching:
+        yield f"not pushed, since bodies of the model would touch on the way: {', '.join(touching)}"
+    if unreached:
+        yield f"not pushed, since the joint did not get there: {', '.join(unreached)}"
 
 
 def _noise(values: Array) -> float:

@@ -8,19 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_arm import bench, post
+from bench_arm import along, bench, post
 from hard_cases import stick
 from sweep_arms import random_arm
 
 from armlink.arm_file import ArmFile, load_arm
+from armlink.cli import run
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
 from calib.motion.encoder_check import EncoderFault
+from calib.motion.mover import Mover, Stalled
 from calib.plan.collisions import Geometry
 from calib.plan.drawing import stops_seconds
-from calib.sweep.preflight import HOT, find_stops, listen
+from calib.sweep.preflight import HOT, Preflight, find_stops, listen
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
@@ -142,20 +144,70 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
 
 def test_a_stop_on_whose_way_bodies_touch_is_left_out(tmp_path: Path) -> None:
     """The arm, stretched out, meets the post on the shoulder's way up."""
-    (tmp_path / "simulated.yaml").write_text(f"{Path(bench(tmp_path, post(0.3, 0.3)).path).read_text()}sim: {{}}")
-    arm = load_arm(str(tmp_path / "simulated.yaml"))
+    found, clear = searched(simulated_bench(tmp_path, post(0.3, 0.3)))
+    np.testing.assert_allclose(found.stops, [[np.nan, 1.2], [-1.5, 1.5]], atol=0.01)
+    assert clear
+    assert found.left_out == (
+        "not pushed, since bodies of the model would touch on the way: the lower stop of shoulder",
+    )
+
+
+def simulated_bench(folder: Path, obstacle: str) -> ArmFile:
+    (folder / "simulated.yaml").write_text(f"{Path(bench(folder, obstacle).path).read_text()}sim: {{}}")
+    return load_arm(str(folder / "simulated.yaml"))
+
+
+def searched(arm: ArmFile) -> tuple[Preflight, bool]:
+    """What the search for stops found, and whether all its commands were clear of the model's shapes."""
     geometry, commanded = Geometry(arm), list[np.ndarray]()
     with enabled(SimulatedArm(arm, Truth.of(arm), 1), arm) as link:
-        listened, whole = listen(link, arm), link.cycle
+        listened, whole, sent_ahead = listen(link, arm), link.cycle, link.play
 
         def noted(command: Any) -> Any:
             commanded.append(command.position.copy())
             return whole(command)
 
-        link.cycle = noted  # type: ignore[method-assign]
+        def played(setpoints: Any) -> Any:
+            commanded.extend(setpoints.position)
+            return sent_ahead(setpoints)
+
+        link.cycle, link.play = noted, played  # type: ignore[method-assign]
         found = find_stops(link, arm, listened)
-    np.testing.assert_allclose(found.stops, [[np.nan, 1.2], [-1.5, 1.5]], atol=0.01)
-    assert geometry.free(np.array(commanded)[::20]).all()
+    return found, bool(geometry.free(np.array(commanded)[::20]).all())
+
+
+def test_after_a_joint_that_does_not_get_there_no_way_leads_through_what_stands_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The elbow is bent on the way there; the way to the middle would lead the stretched arm through the post."""
+    touch = Mover.touch
+
+    def weak(mover: Mover, stops: Any) -> Any:
+        if stops[0] < 0:
+            raise Stalled("shoulder", 0.0, 0.0, 0)
+        return touch(mover, stops)
+
+    monkeypatch.setattr(Mover, "touch", weak)
+    found, clear = searched(simulated_bench(tmp_path, post(*along(-0.4, 0.0, 1.13), half=0.02)))
+    assert clear
+    assert found.left_out == (
+        "not pushed, since bodies of the model would touch on the way: the upper stop of shoulder",
+        "not pushed, since the joint did not get there: the lower stop of shoulder",
+    )
+
+
+def test_the_command_names_the_stops_that_it_left_out_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ended(*_: Any, **__: Any) -> Any:
+        raise Refused("enough")
+
+    monkeypatch.setattr("calib.sweep.run.run_sweep", ended)
+    simulated_bench(tmp_path, post(0.3, 0.3))
+    out = str(tmp_path / "out")
+    assert run(["sweep", str(tmp_path / "simulated.yaml"), "--dry-run", "--check-stops", "--out", out]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.count("bodies of the model would touch on the way: the lower stop of shoulder") == 1
 
 
 def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
