@@ -19,6 +19,8 @@ DEPTH = 0.0005
 """Overlap from which bodies count as touching [m]; a choice, below the accuracy of collision meshes."""
 PARKED = "parked "
 """Prefix of the body names of an arm that is parked beside this one, where it has a model of its own."""
+TO_THE_PLAN = "on the way from its present pose to the first pose"
+"""Description of the way on which a plan is reached."""
 Pair = tuple[str, str]
 
 
@@ -116,15 +118,18 @@ class Geometry:
         return "the surroundings" if body == 0 else str(self.model.body(body).name or f"body {body}")
 
 
-def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
-    """Check all poses along a plan; raises Collided naming bodies, sweep and pose. Returns a sentence on the check."""
+def check_plan(arm_file: ArmFile, plan: SweepPlan, here: Array | None = None) -> str:
+    """Check all poses along a plan, and on the way to it from `here` (n,) [rad], where that is known.
+
+    Raises Collided naming bodies, sweep and pose. Returns a sentence on the check.
+    """
     if arm_file.model_path is None:
         return "collisions are not checked: the arm file has no kinematics.model with geometry"
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return f"collisions are not checked: {geometry.left_out or 'the model has no geometry'}"
     count = 0
-    for place, pose in poses_along(plan):
+    for place, pose in poses_along(plan, here):
         count += 1
         _require_free(arm_file, geometry, place, pose)
     without = f", without {geometry.left_out}" if geometry.left_out else ""
@@ -137,7 +142,7 @@ def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: A
     Raises Collided naming bodies, sweep and pose.
     """
     home = np.array(plan.scout[0])
-    for where, pose in _between(here, home, "on the way from its present pose to the first pose"):
+    for where, pose in _between(here, home, TO_THE_PLAN):
         _require_free(arm_file, geometry, where, pose)
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)
@@ -157,12 +162,12 @@ def _require_free(arm_file: ArmFile, geometry: Geometry, place: str, pose: Array
         )
 
 
-def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:
-    """(Description, pose (n,) [rad]) of all motion of a plan, straight from one pose to the next."""
-    here = None
+def poses_along(plan: SweepPlan, here: Array | None = None) -> Iterator[tuple[str, Array]]:
+    """(Description, pose (n,) [rad]) of all motion of a plan, straight from one pose to the next, the first from `here`
+    (n,) [rad]."""
     for number, scouted in enumerate(plan.scout, start=1):
-        goal = np.array(scouted)
-        yield from _between(here, goal, f"on the way to pose {number} of the {SCOUT_TITLE}")
+        goal, first = np.array(scouted), number == 1 and here is not None
+        yield from _between(here, goal, TO_THE_PLAN if first else f"on the way to pose {number} of the {SCOUT_TITLE}")
         here = goal
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)

@@ -55,7 +55,7 @@ class StepPass(SweepPass):
         plan = self.data.plan
         if plan is None:
             first = plan_sweep(self.arm, seed=seed, reference_mass=reference_mass)
-            self._check(first)
+            self._check(first, None if self.readings else self.mover.command.position)
             self.expected = reading_seconds(self.arm, first)
             self._scout(first)
             resolution = self.mover.known_resolution
@@ -71,9 +71,9 @@ class StepPass(SweepPass):
         self.mover.average_to(plan.standard_error)
         return plan
 
-    def _check(self, plan: SweepPlan) -> None:
+    def _check(self, plan: SweepPlan, here: Array | None = None) -> None:
         check_limits(self.arm, plan)
-        check_plan(self.arm, plan)
+        check_plan(self.arm, plan, here)
 
     def _save(self, reading: StaticReading) -> None:
         self.writer.append(reading)

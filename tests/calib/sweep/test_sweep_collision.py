@@ -9,7 +9,7 @@ import pytest
 from bench_arm import along, bench, post
 
 from armlink.cli import run
-from calib.plan.collisions import Collided, Geometry, check_plan, poses_along
+from calib.plan.collisions import POINTS, Collided, Geometry, check_plan, poses_along
 from calib.plan.planned_arm import PlannedArm
 from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.verify import verify_poses
@@ -53,6 +53,21 @@ def test_a_way_that_touches_is_refused_with_bodies_and_pose(tmp_path: Path) -> N
             assert Geometry(arm).free(np.array(scouted)).all()  # a plan of this arm goes by other poses
             return
     pytest.fail("no way of this plan is clear of all its places")
+
+
+def test_the_way_from_the_present_pose_is_checked_as_the_plan_is(tmp_path: Path) -> None:
+    arm = bench(tmp_path, post(*along(0.5, 0.0, 0.8), half=0.02))
+    plan, planned = plan_sweep(arm), PlannedArm(arm)
+    first = np.array(plan.scout[0])
+    poses = planned.free_poses(10, np.random.default_rng(2))
+    blocked = next(pose for pose in poses if not planned.is_clear(pose, first))
+    clear = next(pose for pose in poses if planned.is_clear(pose, first))
+    assert int(check_plan(arm, plan, clear).split()[3]) == int(check_plan(arm, plan).split()[3]) + POINTS - 1
+    with pytest.raises(Collided, match=r"touch \w+ on the way from its present pose to the first pose, .* mm deep, at"):
+        check_plan(arm, plan, blocked)
+    place, pose = next(poses_along(plan, blocked))
+    assert place == "on the way from its present pose to the first pose"
+    np.testing.assert_allclose(pose, blocked + (first - blocked) / POINTS)
 
 
 def test_verification_goes_around_what_stands_in_the_way(tmp_path: Path) -> None:
