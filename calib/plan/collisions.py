@@ -1,7 +1,8 @@
 """Collisions of the arm with itself or its surroundings, by MuJoCo's contacts on the arm file's model."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -160,6 +161,20 @@ def _require_free(arm_file: ArmFile, geometry: Geometry, place: str, pose: Array
             f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
             " file, or clear the workspace"
         )
+
+
+def clear_way(arm_file: ArmFile, geometry: Geometry | None, ways: Sequence[Sequence[Array]], place: str) -> list[Array]:
+    """The first of some ways by poses (n,) [rad] on which nothing touches beyond their common first pose, at which the
+    arm stands already; without geometry the first. Raises Collided, as check_plan, for the first where all touch."""
+    for way in ways:
+        legs = [straight_way(*leg)[1:] for leg in pairwise(way)]
+        if geometry is None or all(geometry.free(leg).all() for leg in legs):
+            return list(way)
+    assert geometry is not None
+    for start, goal in pairwise(ways[0]):
+        for where, pose in _between(start, goal, place):
+            _require_free(arm_file, geometry, where, pose)
+    raise AssertionError("a way that is not clear has a pose that is not free")
 
 
 def poses_along(plan: SweepPlan, here: Array | None = None) -> Iterator[tuple[str, Array]]:

@@ -13,12 +13,13 @@ from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Slipped, Stalled
 from calib.motion.static_reading import StaticReading, stack
-from calib.plan.collisions import check_plan
+from calib.plan.collisions import Collided, Geometry, check_plan, clear_way
 from calib.plan.drawing import reading_seconds
 from calib.plan.plan_limits import check_bias, check_limits
+from calib.plan.planned_arm import PlannedArm
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.sweep_plan import plan_sweep
-from calib.plan.types import APPROACH, SCOUT, SCOUT_ACCELERATION, Sweep, SweepPlan, reading_name
+from calib.plan.types import APPROACH, SCOUT, SCOUT_ACCELERATION, SCOUT_TITLE, Sweep, SweepPlan, reading_name
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array
 
@@ -48,14 +49,18 @@ RETRIES = 3
 
 class StepPass(SweepPass):
     acceleration = 1.0
+    astray = False
+    """Whether the arm may stand elsewhere than where the checked ways of the plan have it."""
 
     def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
         """That of the data set, else a new one, with the bias torques that the scout finds."""
         self.readings, self.refuge = list(self.data.readings), self.mover.position.copy()
+        self._geometry: Geometry | None = PlannedArm(self.arm).geometry
+        self.astray = bool(self.readings)
         plan = self.data.plan
         if plan is None:
             first = plan_sweep(self.arm, seed=seed, reference_mass=reference_mass)
-            self._check(first, None if self.readings else self.mover.command.position)
+            self._check(first, None if self.astray else self.mover.command.position)
             self.expected = reading_seconds(self.arm, first)
             self._scout(first)
             resolution = self.mover.known_resolution
@@ -65,6 +70,7 @@ class StepPass(SweepPass):
         else:
             check_bias(self.arm, plan)
             self._check(plan)
+            self.astray = True
             self.mover.resolution = np.where(self.data.resolution > 0, self.data.resolution, np.inf)
         self.expected = reading_seconds(self.arm, plan)
         self.acceleration, self.refuge = plan.travel_acceleration, np.array(plan.scout[0])
@@ -74,6 +80,26 @@ class StepPass(SweepPass):
     def _check(self, plan: SweepPlan, here: Array | None = None) -> None:
         check_limits(self.arm, plan)
         check_plan(self.arm, plan, here)
+
+    def bridge(self, stall: Stall, reading: str) -> None:
+        super().bridge(stall, reading)
+        self.astray = True
+
+    def _travel(self, ways: Sequence[Sequence[Array]], acceleration: float, place: str) -> None:
+        """Travel the first of some ways by poses (n,) [rad]; where the arm is astray, the first that is clear.
+
+        Raises Stalled; Collided where none is clear, before anything moves.
+        """
+        mover, way = self.mover, list(ways[0])
+        if self.astray:
+            begin = mover.command.position.copy()
+            way = clear_way(self.arm, self._geometry, [[begin, *each] for each in ways], place)[1:]
+        self.astray = True
+        for number, pose in enumerate(way):
+            if number:
+                mover.hold_all()
+            mover.travel(pose, acceleration)
+        self.astray = False
 
     def _save(self, reading: StaticReading) -> None:
         self.writer.append(reading)
@@ -91,25 +117,28 @@ class StepPass(SweepPass):
                 self.bridge(stall, f"{SCOUT} {sum(reading.sweep == SCOUT for reading in self.readings) + 1}")
 
     def _read_scout(self, plan: SweepPlan) -> None:
-        """A pose that the drives cannot reach is left out; raises Stalled where too few were reached to know the arm's
-        weight."""
+        """A pose that the drives cannot reach, or the way to which is no longer clear, is left out; raises Stalled or
+        Collided where too few were reached to know the arm's weight."""
         mover, done = self.mover, {reading.index for reading in self.readings if reading.sweep == SCOUT}
         everything = np.ones(mover.link.n, dtype=bool)
-        acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
+        acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Refused]()
         for index, pose in enumerate(plan.scout):
             if index in done:
                 continue
-            stalls = list[Stalled]()
+            failures = list[Refused]()
             for goal in (np.array(pose), np.array(pose), last):
                 try:
-                    mover.travel(goal, acceleration)
+                    self._travel([[goal]], acceleration, f"on the way to pose {index + 1} of the {SCOUT_TITLE}")
                     break
+                except Collided as collided:
+                    failures.append(collided)
                 except Stalled as stall:
-                    stalls.append(stall)
+                    failures.append(stall)
                     mover.come_to_rest()
                     acceleration = max(SLOWER * acceleration, SLOWEST)
-            if len(stalls) > 1:
-                unreached.append(stalls[0])
+            if len(failures) > 1:
+                unreached.append(failures[0])
+                self.astray = True  # the plan leads to the next pose from this one
                 continue
             self._save(mover.rest(everything).within(SCOUT, index, everything))
             last = mover.position.copy()
@@ -149,18 +178,22 @@ class StepPass(SweepPass):
             open_readings.pop(0)
 
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
-        """Bring the resting joints to their places, by way of a pose known to be good, and press or hold them there."""
+        """Bring the resting joints to their places, and press or hold them there; as a `detour`, by way of a pose known
+        to be good, where that way is clear."""
         mover = self.mover
         if detour:
             mover.come_to_rest()
-            mover.travel(self.refuge, self.acceleration)
         mover.hold_all()
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):
             goal[joint] = mover.before_stop(int(joint), int(stops[joint]), STOP_DISTANCE)
         goal[sweep.joint] = target - direction * APPROACH
-        mover.travel(goal, self.acceleration)
+        ways = [[goal], [self.refuge, goal]]
+        if detour:
+            self.astray = True
+            ways.reverse()
+        self._travel(ways, self.acceleration, f"on the way from its present pose to sweep {sweep.name}")
         if stops.any():
             mover.press(stops, bias)
 
