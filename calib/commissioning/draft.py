@@ -87,6 +87,7 @@ class Draft:
 
 
 def draft_of_model(
+    name: str,
     path: Path,
     chain: Chain,
     gravity: tuple[float, float, float],
@@ -118,7 +119,7 @@ def draft_of_model(
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)} {'have' if len(free) > 1 else 'has'} no stop to be pressed on" if free else None
-    ends = path.stem, path, tip, gravity, joints, chain.aside, notes
+    ends = name, path, tip, gravity, joints, chain.aside, notes
     return Draft(*ends, base=chain.base, servo=servo, locked=locked or {})
 
 

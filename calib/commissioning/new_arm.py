@@ -157,13 +157,12 @@ def new_arm(
     given = _given_stops(chain, dict(stops or {}), model, questions)
     names = [joint.name for joint in chain.joints]
     _refuse_other_joints("--rated-torque", ratings or {}, names, f"of the arm in {model}")
-    draft = draft_of_model(model, chain, gravity, given, ratings, locked)
+    draft = draft_of_model(name or out.stem, model, chain, gravity, given, ratings, locked)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
         draft.notes.append(
             f"tip assumed: the model has {len(chains)} arms; choose another arm by its last body, {others} (--tip)"
         )
-    draft.name = name or out.stem
     made = NewArm(out, draft)
     for found in model_errors(made.parsed()):
         raise BadInput(str(found))

@@ -80,7 +80,7 @@ def drafted(model: Path, ratings: Mapping[str, float] | None = None) -> NewArm:
     """As `new` has it before it looks for collisions, which takes long; raises BadInput as it does."""
     joints, gravity = model_joints(model)
     chain = find_chains(joints, model)[0]
-    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, ratings))
+    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model.stem, model, chain, gravity, {}, ratings))
     for found in model_errors(made.parsed()):
         raise BadInput(str(found))
     return made
