@@ -131,7 +131,7 @@ def joint_state_encoder(
 
 
 def _head(names: Sequence[str], frame: str = "") -> bytes:
-    """What stands between the stamp and the lists: the frame, and the names with their number."""
+    """The part between the stamp and the lists: the frame, and the names with their number."""
     head = bytearray(_STAMPED)
 
     def add(text: str) -> None:

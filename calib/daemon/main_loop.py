@@ -174,7 +174,7 @@ class Daemon:
         self._ended.set()
 
     def _ending(self) -> Tell:
-        """What is told, by the thread of `_bus_ends`, while the arm comes to its end: it goes to the log, and systemd
+        """Takes the news, by the thread of `_bus_ends`, while the arm comes to its end: it goes to the log, and systemd
         waits."""
         say = said(self.arm.name, self._presses)
 

@@ -1,4 +1,9 @@
-"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out."""
+"""Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out.
+
+In order: the model (`sim_gap.model`), the check of joints, units and clocks (`sim_gap.checks`), prepared recordings and
+residuals (`sim_gap.residuals`), selection and fit of effects (`sim_gap.search`), causes, and the answer with verdict
+(this package). Recordings without torque go another way after the check: `position_answer` explains their positions.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

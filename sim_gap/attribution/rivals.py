@@ -59,7 +59,7 @@ GENERAL_MOTION = (
 
 
 def separating_motion(effect: str, rivals: Sequence[str]) -> str | None:
-    """What to record so that an effect and the first of its rivals differ; None without a rival."""
+    """A motion to record so that an effect and the first of its rivals differ; None without a rival."""
     return SEPARATING_MOTION.get(frozenset({effect, rivals[0]}), GENERAL_MOTION) if rivals else None
 
 

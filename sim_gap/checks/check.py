@@ -1,5 +1,9 @@
-"""Entry point of the check, before anything is fitted: recordings and a model in, corrected recordings and findings
-out."""
+"""Entry point of the check before any fit: recordings and a model in, corrected recordings and findings out.
+
+A finding that is certain is corrected; one that is not names the options that settle it, and the recording is diagnosed
+as it is. Times, counts, jumps and ranges that no arm can have end the diagnosis, and without a torque channel commands
+that do not belong to the positions do.
+"""
 
 import re
 from collections.abc import Collection, Sequence

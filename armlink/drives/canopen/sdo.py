@@ -131,7 +131,7 @@ class NodeServices:
         return struct.unpack("<" + entry.code, data)[0]
 
     def _transfer(self, entry: Entry, transfer: Callable[[int, int], Any]) -> Any:
-        """What an upload or download returns; raises BusFault, or SdoAbortedError if the device refuses."""
+        """The answer of an upload or download; raises BusFault, or SdoAbortedError if the device refuses."""
         try:
             return transfer(entry.index, entry.sub)
         except SdoAbortedError:
