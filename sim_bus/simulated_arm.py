@@ -219,8 +219,7 @@ class SimulatedArm:
 
     @property
     def _longest_step(self) -> float:
-        """A SYNC period, or the shorter period in which a drive sends by its own clock [s]: to a slow host it sends
-        several times a cycle."""
+        """A SYNC period, or the shorter one of a drive that sends several times a cycle to a slow host [s]."""
         return min([self.period, *(drive.own_period for drive in self.drive_at.values())])
 
     # ---- truth, hidden from any fit

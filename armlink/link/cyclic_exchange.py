@@ -70,8 +70,7 @@ class Loop:
         self.woke = -math.inf
         """When it last began to take in replies that nobody waited for, by the clock [s]."""
         self._drained = -math.inf
-        """When it last had taken in all that came between cycles, by the clock [s]: a cycle, whose frames the watch
-        counts, goes from one such instant to the next."""
+        """When it last had taken in all of a cycle [s]: the watch counts the frames from there to the next time."""
         self.just_woke = False
         """Whether that was after the last commands."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None

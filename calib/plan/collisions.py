@@ -1,6 +1,6 @@
 """Collisions of the arm with itself or its surroundings, by MuJoCo's contacts on the arm file's model."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -129,10 +129,7 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan, here: Array | None = None) ->
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return f"collisions are not checked: {geometry.left_out or 'the model has no geometry'}"
-    count = 0
-    for place, pose in poses_along(plan, here):
-        count += 1
-        _require_free(arm_file, geometry, place, pose)
+    count = _require_free(arm_file, geometry, poses_along(plan, here))
     without = f", without {geometry.left_out}" if geometry.left_out else ""
     return f"no collision at {count} poses along the way{without}"
 
@@ -143,38 +140,44 @@ def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: A
     Raises Collided naming bodies, sweep and pose.
     """
     home = np.array(plan.scout[0])
-    for where, pose in _between(here, home, TO_THE_PLAN):
-        _require_free(arm_file, geometry, where, pose)
+    _require_free(arm_file, geometry, _between(here, home, TO_THE_PLAN))
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)
         for start, goal, place in ((home, begin, "on the way to sweep"), (begin, end, "in sweep")):
-            for where, pose in _between(start, goal, f"{place} {sweep.name}"):
-                _require_free(arm_file, geometry, where, pose)
+            _require_free(arm_file, geometry, _between(start, goal, f"{place} {sweep.name}"))
 
 
-def _require_free(arm_file: ArmFile, geometry: Geometry, place: str, pose: Array) -> None:
-    touching = geometry.contacts(pose)
-    if touching:
-        first, second = touching[0].bodies
-        raise Collided(
-            f"{arm_file.name}: {first} would touch {second} {place}, {touching[0].depth * 1000:.1f} mm deep, at"
-            f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
-            " file, or clear the workspace"
-        )
+def _require_free(arm_file: ArmFile, geometry: Geometry, places: Iterable[tuple[str, Array]]) -> int:
+    """How many poses (n,) [rad], each with its description, were looked at; raises Collided at the first contact."""
+    count = 0
+    for place, pose in places:
+        count += 1
+        touching = geometry.contacts(pose)
+        if touching:
+            first, second = touching[0].bodies
+            raise Collided(
+                f"{arm_file.name}: {first} would touch {second} {place}, {touching[0].depth * 1000:.1f} mm deep, at"
+                f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
+                " file, or clear the workspace"
+            )
+    return count
 
 
-def clear_way(arm_file: ArmFile, geometry: Geometry | None, ways: Sequence[Sequence[Array]], place: str) -> list[Array]:
+def clear_way(
+    arm_file: ArmFile, geometry: Geometry | None, ways: Sequence[Sequence[Array]], place: str
+) -> Sequence[Array]:
     """The first of some ways by poses (n,) [rad] on which nothing touches beyond their common first pose, at which the
     arm stands already; without geometry the first. Raises Collided, as check_plan, for the first where all touch."""
+    found = list[Collided]()
     for way in ways:
-        legs = [straight_way(*leg)[1:] for leg in pairwise(way)]
-        if geometry is None or all(geometry.free(leg).all() for leg in legs):
-            return list(way)
-    assert geometry is not None
-    for start, goal in pairwise(ways[0]):
-        for where, pose in _between(start, goal, place):
-            _require_free(arm_file, geometry, where, pose)
-    raise AssertionError("a way that is not clear has a pose that is not free")
+        try:
+            if geometry is not None:
+                for leg in pairwise(way):
+                    _require_free(arm_file, geometry, _between(*leg, place))
+            return way
+        except Collided as collided:
+            found.append(collided)
+    raise found[0]
 
 
 def poses_along(plan: SweepPlan, here: Array | None = None) -> Iterator[tuple[str, Array]]:

@@ -3,7 +3,7 @@
 A drive that gets too hot later says so by an emergency, which ends any sweep.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -50,7 +50,7 @@ class Preflight:
     temperature: Array
     """Of the drives (n,) [°C]; NaN where a drive does not report it."""
     left_out: tuple[str, ...] = ()
-    """What was not pushed although it was to be, and why: a sentence for each reason, with side and joint."""
+    """Stops that were to be pushed and were not: a sentence for each reason, with side and joint."""
 
 
 def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
@@ -144,7 +144,7 @@ def find_stops(
     mover = Mover(link, planned.section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2
-    stops, touching, unreached = np.full((link.n, 2), np.nan), list[str](), list[str]()
+    stops, left_out = np.full((link.n, 2), np.nan), dict[str, list[str]]()
     for count, joint in enumerate(reversed(range(link.n))):
         for end, side in enumerate((-1, 1)):
             goal, here = middle.copy(), mover.command.position.copy()
@@ -155,7 +155,7 @@ def find_stops(
             way = next((each for each in ways if all(planned.is_clear(*leg) for leg in pairwise(each))), None)
             name = f"the {'lower' if side < 0 else 'upper'} stop of {link.names[joint]}"
             if way is None:
-                touching.append(name)
+                left_out.setdefault("bodies of the model would touch on the way", []).append(name)
             else:
                 try:
                     for pose in way[1:-1]:
@@ -167,27 +167,20 @@ def find_stops(
                     mover.travel(goal, 1.0)
                 except Stalled:  # too heavy to hold there: the sweeps, which know the weight, look again
                     if np.isnan(stops[joint, end]):
-                        unreached.append(name)
+                        left_out.setdefault("the joint did not get there", []).append(name)
                     mover.hold_all()
                     _travel_if_clear(mover, planned, middle)
             if report is not None:
                 report(2 * count + end + 1, 2 * link.n)
     _travel_if_clear(mover, planned, middle)
-    return replace(found, stops=stops, left_out=tuple(_left_out(touching, unreached)))
+    sentences = (f"not pushed, since {why}: {', '.join(names)}" for why, names in left_out.items())
+    return replace(found, stops=stops, left_out=tuple(sentences))
 
 
 def _travel_if_clear(mover: Mover, planned: PlannedArm, goal: Array) -> None:
     """Go straight to a pose (n,) [rad], or stay where the model's shapes are in the way."""
     if planned.is_clear(mover.command.position, goal):
         mover.travel(goal, 1.0)
-
-
-def _left_out(touching: Sequence[str], unreached: Sequence[str]) -> Iterator[str]:
-    """Sentences on the stops that were not pushed."""
-    if touching:
-        yield f"not pushed, since bodies of the model would touch on the way: {', '.join(touching)}"
-    if unreached:
-        yield f"not pushed, since the joint did not get there: {', '.join(unreached)}"
 
 
 def _noise(values: Array) -> float:

@@ -81,16 +81,12 @@ class StepPass(SweepPass):
         check_limits(self.arm, plan)
         check_plan(self.arm, plan, here)
 
-    def bridge(self, stall: Stall, reading: str) -> None:
-        super().bridge(stall, reading)
-        self.astray = True
-
     def _travel(self, ways: Sequence[Sequence[Array]], acceleration: float, place: str) -> None:
         """Travel the first of some ways by poses (n,) [rad]; where the arm is astray, the first that is clear.
 
         Raises Stalled; Collided where none is clear, before anything moves.
         """
-        mover, way = self.mover, list(ways[0])
+        mover, way = self.mover, ways[0]
         if self.astray:
             begin = mover.command.position.copy()
             way = clear_way(self.arm, self._geometry, [[begin, *each] for each in ways], place)[1:]
@@ -115,6 +111,7 @@ class StepPass(SweepPass):
                 return self._read_scout(plan)
             except Stall as stall:
                 self.bridge(stall, f"{SCOUT} {sum(reading.sweep == SCOUT for reading in self.readings) + 1}")
+                self.astray = True
 
     def _read_scout(self, plan: SweepPlan) -> None:
         """A pose that the drives cannot reach, or the way to which is no longer clear, is left out; raises Stalled or
