@@ -24,6 +24,8 @@ UNIT_FACTORS = np.geomspace(1e-3, 2e3, 32)
 """Numbers that may be recorded of one newton metre: a torque constant with a gear or without, mA."""
 ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
+ZERO_OFFSETS = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3)
+"""Errors of a position's zero that are an effect of an arm [rad]."""
 POSITION_CHOICES = 4
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
 STATEMENTS = {"sign": "sign", "unsigned": "sign", "zero": "zero", "scale": "units"}
@@ -47,6 +49,10 @@ class Hypothesis:
     """Number of things that are chosen in it, each as rare as an effect of the library."""
     corrects: bool = True
     """Whether the option can be carried out as it stands."""
+    readings: tuple[int, ...] = ()
+    """Which reading each joint has then, if not its own."""
+    of_arm: bool = False
+    """Whether this is an effect of the arm, which the diagnosis finds by itself."""
 
 
 def hypotheses(
@@ -100,6 +106,13 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
         text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
         what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
         yield Hypothesis("zero", ("q",), (j,), what, text, change, POSITION_CHOICES)
+
+
+def zero_offsets(arm: RigidArm) -> Iterator[Hypothesis]:
+    """Zeros of the positions that are off as far as those of sound arms are."""
+    for j, angle in product(range(arm.n), ZERO_OFFSETS):
+        what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
+        yield Hypothesis("zero", ("q",), (j,), what, "", change, of_arm=True)
 
 
 def _units(arm: RigidArm, motion: ChannelMotion) -> Iterator[Hypothesis]:
@@ -196,7 +209,8 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
         motion = _positions(motion, order) if "q" in channels else motion
         return _torques(motion, order) if torque in channels else motion
 
-    return Hypothesis("order", tuple(channels), touched, what, option, change, choices=len(touched) - 1)
+    readings = order if torque in channels else ()
+    return Hypothesis("order", tuple(channels), touched, what, option, change, len(touched) - 1, readings=readings)
 
 
 def _positions(
