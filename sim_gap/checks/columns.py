@@ -51,12 +51,9 @@ class HypothesisTest:
         by_joint = self.falls.sum(1)
         common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
         alone = common and self.fall < float(by_joint.max())
-        return not alone and _exceeds(self.falls.sum(0), self.least)
-
-
-def _exceeds(falls: Array, least: float) -> bool:
-    """Whether the falls in held-out parts (F,) are more than that, and than chance."""
-    return bool(falls.sum() > max(least, SIGNIFICANT * falls.std(ddof=1) * np.sqrt(len(falls))))
+        by_part = self.falls.sum(0)
+        chance = SIGNIFICANT * float(by_part.std(ddof=1)) * np.sqrt(len(by_part))
+        return not alone and self.fall > max(self.least, chance)
 
 
 def _is_likelier(one: HypothesisTest, other: HypothesisTest) -> bool:
@@ -83,8 +80,8 @@ def find_wrong_columns(
         possible += _likely_orders(arm, motion, follows)
     falls = _quick_falls(arm, motion, possible)
     likely = [*(each for each in possible if each.option in known), *_likeliest(possible, falls)]
-    effects = list(zero_offsets(arm))
-    likely += [effects[k] for k in np.argsort(-_quick_falls(arm, motion, effects))[:2]]
+    offsets = list(zero_offsets(arm))
+    likely.append(offsets[int(_quick_falls(arm, motion, offsets).argmax())])
     tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
     tests = [test for test in tests if test.is_certain]
     if not tests:

@@ -225,8 +225,8 @@ def _positions(
 def _torques(motion: ChannelMotion, order: Sequence[int] | None = None, factor: Array | float = 1.0) -> ChannelMotion:
     """The motion with readings in another order, unit or sign."""
     every = list(range(motion.q.shape[1]) if order is None else order)
-    size = np.abs(factor) * motion.size[every]
-    return replace(motion, reading=factor * motion.reading[:, every], size=size, idle=motion.idle[every])
+    size, noise = (np.abs(factor) * x[every] for x in (motion.size, motion.noise))
+    return replace(motion, reading=factor * motion.reading[:, every], size=size, noise=noise, idle=motion.idle[every])
 
 
 def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:

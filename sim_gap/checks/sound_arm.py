@@ -35,6 +35,8 @@ class ChannelMotion:
     """Time from the first row to the last [s]."""
     size: Array
     """Standard deviation of what is recorded, in the unit of the reading, (n,): of a torque in another unit, say."""
+    noise: Array
+    """Standard deviation of the noise of each reading, as of numbers that are rounded, (n,)."""
     idle: Mask
     """Whether each reading may have nothing of the model's torque, (n,): of a motor that is idle, a dead sensor."""
     rubs: bool = True
@@ -69,7 +71,7 @@ def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
     size, idle = reading.std(0), np.ones(reading.shape[1], bool)
     rubs = channel != "tau" or "tau_motor" in s.reading
-    return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, idle, rubs)
+    return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, s.noise[channel], idle, rubs)
 
 
 ERROR_STD = 0.3
@@ -153,9 +155,9 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    q, v, a, read, size, idle, rubs = (
+    q, v, a, read, size, noise, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
-        for name in ("q", "v", "a", "reading", "size", "idle", "rubs")
+        for name in ("q", "v", "a", "reading", "size", "noise", "idle", "rubs")
     )
     telling = _telling(v, read, np.array([motion.channel == "tau" for motion in motions])[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
@@ -164,7 +166,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
     count = _measurements(q, v, size, motions[0].duration)
-    floor = LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE)
+    floor = _least_left(size, noise)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
     turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
@@ -181,6 +183,11 @@ def _model_size(model: Array) -> Array:
     """Torque in proportion to which each joint of a sound arm has its errors, (…, n); model torques (…, K, n)."""
     size = model.std(-2)
     return np.asarray(np.maximum(size, np.maximum(LEAST_TORQUE_SHARE * size.max(-1, keepdims=True), 1e-9)))
+
+
+def _least_left(size: Array, noise: Array) -> Array:
+    """Least that a model of a sound arm leaves of readings of this size and noise, (…, n)."""
+    return np.hypot(LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE), noise)
 
 
 def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Array, floor: Array) -> Array:
@@ -277,7 +284,7 @@ def _fit(
     acting = tuple(np.concatenate([j * width + alone, common]) for j in range(n))
     columns = (-np.vstack([own[j], shared[:, j]]) for j in range(n))
     squares, products, totals, counts = fold_sums(columns, reading, weight, fold)
-    floor = LEAST_RESIDUAL * np.maximum(motion.size, SMALLEST_TORQUE)
+    floor = _least_left(motion.size, motion.noise)
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(

@@ -45,7 +45,7 @@ def check(arm, recording, stated=AS_IT_IS):
 
 def wrong_columns(arm, q, v, a, reading):
     """The finding on a motor's torque over 30 s."""
-    channel = ChannelMotion(q, v, a, reading, "tau_motor", 30.0, reading.std(0), np.ones(3, bool))
+    channel = ChannelMotion(q, v, a, reading, "tau_motor", 30.0, reading.std(0), np.zeros(3), np.ones(3, bool))
     return find_wrong_columns(arm, channel, AS_IT_IS, ())
 
 

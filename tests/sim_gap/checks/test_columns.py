@@ -21,9 +21,8 @@ MOTION = motion(3, SECONDS, RATE, seed=3)
 
 def channel(reading: np.ndarray, source: str = "tau_motor", moved=MOTION) -> ChannelMotion:
     t, q, v, a = moved
-    return ChannelMotion(
-        q, v, a, reading, source, float(t[-1] - t[0]), reading.std(0), np.ones(3, bool), source != "tau"
-    )
+    size, noise, idle = reading.std(0), np.zeros(3), np.ones(3, bool)
+    return ChannelMotion(q, v, a, reading, source, float(t[-1] - t[0]), size, noise, idle, source != "tau")
 
 
 def found(read: ChannelMotion, stated=AS_IT_IS) -> RecordingFinding | None:
