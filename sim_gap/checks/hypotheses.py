@@ -13,7 +13,7 @@ from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.sound_arm import ChannelMotion, measurements
+from sim_gap.checks.sound_arm import ChannelMotion
 
 LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
@@ -187,7 +187,7 @@ def exchangeable(
 ) -> list[tuple[tuple[str, ...], list[int]]]:
     """Channels whose columns may be in another order, and the joints: of torques or positions alone only those that
     are judged, or the readings that count would not be the same before and after."""
-    positions, judged = ("q", *follows), np.flatnonzero(measurements(motion)).tolist()
+    positions, judged = ("q", *follows), np.flatnonzero(motion.count).tolist()
     return [((*positions, motion.channel), [*range(arm.n)]), (positions, judged), ((motion.channel,), judged)]
 
 
@@ -225,8 +225,9 @@ def _positions(
 def _torques(motion: ChannelMotion, order: Sequence[int] | None = None, factor: Array | float = 1.0) -> ChannelMotion:
     """The motion with readings in another order, unit or sign."""
     every = list(range(motion.q.shape[1]) if order is None else order)
-    size, noise = (np.abs(factor) * x[every] for x in (motion.size, motion.noise))
-    return replace(motion, reading=factor * motion.reading[:, every], size=size, noise=noise, idle=motion.idle[every])
+    size, least = (np.abs(factor) * x[every] for x in (motion.size, motion.least))
+    read, count, idle = factor * motion.reading[:, every], motion.count[every], motion.idle[every]
+    return replace(motion, reading=read, size=size, count=count, least=least, idle=idle)
 
 
 def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:

@@ -35,8 +35,10 @@ class ChannelMotion:
     """Time from the first row to the last [s]."""
     size: Array
     """Standard deviation of what is recorded, in the unit of the reading, (n,): of a torque in another unit, say."""
-    noise: Array
-    """Standard deviation of the noise of each reading, as of numbers that are rounded, (n,)."""
+    count: Array
+    """Independent measurements of each reading, (n,)."""
+    least: Array
+    """Least that models of sound arms leave of each reading, standard deviation (n,)."""
     idle: Mask
     """Whether each reading may have nothing of the model's torque, (n,): of a motor that is idle, a dead sensor."""
     rubs: bool = True
@@ -65,13 +67,19 @@ def _telling(v: Array, reading: Array, of_sensor: Mask | bool) -> Mask:
 
 def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     """The compared rows of a recording, thinned to about `ROWS`. A sensor on the link feels no gear; where the motor's
-    torque is recorded too, what it feels is behind it."""
+    torque is recorded too, what it feels is behind it. Models leave the noise and a share of the torques of gravity and
+    inertia, which may be more than their sum."""
     t = s.filtered(s.t)
     thin = slice(None, None, max(1, len(t) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
     size, idle = reading.std(0), np.ones(reading.shape[1], bool)
     rubs = channel != "tau" or "tau_motor" in s.reading
-    return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, s.noise[channel], idle, rubs)
+    model, weight = s.arm.carried(q, v, a), s.arm.gravity_torque(q)
+    parts = np.hypot(weight.std(0), (model - weight).std(0)) / np.maximum(model.std(0), SMALLEST_TORQUE)
+    least = np.hypot(s.noise[channel], LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE) * np.maximum(parts, 1.0))
+    duration = float(t[-1] - t[0])
+    count = measurements(q, v, size, duration)
+    return ChannelMotion(q, v, a, reading, channel, duration, size, count, least, idle, rubs)
 
 
 ERROR_STD = 0.3
@@ -113,20 +121,15 @@ ROWS_AT_ONCE = 60_000
 """Rows of all motions that are fitted in one array."""
 
 
-def measurements(motion: ChannelMotion) -> Array:
-    """Independent measurements of each joint, (n,): by the way that the joints make, in strokes; none of one that
-    hardly moves, or whose reading never changes."""
-    return _measurements(motion.q, motion.v, motion.size, motion.duration)
-
-
-def _measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
-    """The same of motions with as many rows: q, v (…, K, n), size (…, n); (…, n)."""
-    stroke = 2.0 * q.std(-2)
-    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=-2) > SMALLEST_MOVING_SHARE)
+def measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
+    """Independent measurements of each joint (n,), by the way that the joints make, in strokes; none of one that hardly
+    moves (q, v (K, n)) or whose reading (of standard deviation `size`) never changes."""
+    stroke = 2.0 * q.std(0)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=0) > SMALLEST_MOVING_SHARE)
     strokes = np.where(moving, 1.0 / np.maximum(stroke, SMALLEST_STROKE), 0.0)
-    squares = ((v * strokes[..., None, :]) ** 2).sum(-1) / np.maximum(moving.sum(-1), 1)[..., None]
-    count = np.minimum(MEASUREMENTS_PER_STROKE * np.sqrt(squares).mean(-1) * duration, MOST_MEASUREMENTS)
-    return np.asarray(count[..., None] * (moving & (size > SMALLEST_TORQUE)))
+    squares = ((v * strokes) ** 2).sum(1) / max(int(moving.sum()), 1)
+    count = min(MEASUREMENTS_PER_STROKE * float(np.sqrt(squares).mean()) * duration, MOST_MEASUREMENTS)
+    return np.asarray(count * (moving & (size > SMALLEST_TORQUE)))
 
 
 def _own_columns(
@@ -155,9 +158,9 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    q, v, a, read, size, noise, idle, rubs = (
+    q, v, a, read, size, count, floor, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
-        for name in ("q", "v", "a", "reading", "size", "noise", "idle", "rubs")
+        for name in ("q", "v", "a", "reading", "size", "count", "least", "idle", "rubs")
     )
     telling = _telling(v, read, np.array([motion.channel == "tau" for motion in motions])[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
@@ -165,8 +168,6 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
-    count = _measurements(q, v, size, motions[0].duration)
-    floor = _least_left(size, noise)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
     turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
@@ -183,11 +184,6 @@ def _model_size(model: Array) -> Array:
     """Torque in proportion to which each joint of a sound arm has its errors, (…, n); model torques (…, K, n)."""
     size = model.std(-2)
     return np.asarray(np.maximum(size, np.maximum(LEAST_TORQUE_SHARE * size.max(-1, keepdims=True), 1e-9)))
-
-
-def _least_left(size: Array, noise: Array) -> Array:
-    """Least that a model of a sound arm leaves of readings of this size and noise, (…, n)."""
-    return np.hypot(LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE), noise)
 
 
 def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Array, floor: Array) -> Array:
@@ -279,12 +275,12 @@ def _fit(
     spread = np.concatenate([own_spread.ravel(), shared_spread])
     read = np.cumsum(np.isfinite(motion.reading).any(1))
     fold = np.maximum(read - 1, 0) * FOLDS // read[-1]
-    weight = telling.T * (measurements(motion) / np.maximum(telling.sum(0), 1) * counted)[:, None]
+    weight = telling.T * (motion.count / np.maximum(telling.sum(0), 1) * counted)[:, None]
     alone, common = np.arange(width), n * width + np.arange(len(shared))
     acting = tuple(np.concatenate([j * width + alone, common]) for j in range(n))
     columns = (-np.vstack([own[j], shared[:, j]]) for j in range(n))
     squares, products, totals, counts = fold_sums(columns, reading, weight, fold)
-    floor = _least_left(motion.size, motion.noise)
+    floor = motion.least
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(
