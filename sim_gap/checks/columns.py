@@ -48,12 +48,15 @@ class HypothesisTest:
     def is_certain(self) -> bool:
         """Whether nothing but the fault can be the reason; what all joints have in common must show without the joint
         that shows it most."""
-        by_joint = self.falls.sum(1)
-        common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
-        alone = common and self.fall < float(by_joint.max())
-        by_part = self.falls.sum(0)
-        chance = SIGNIFICANT * float(by_part.std(ddof=1)) * np.sqrt(len(by_part))
-        return not alone and self.fall > max(self.least, chance)
+        common = len(self.falls) > 1 and self.hypothesis.kind in ("clock", "effort_source")
+        others = np.delete(self.falls, self.falls.sum(1).argmax(), axis=0) if common else self.falls
+        return self.fall > self.least and _exceeds_chance(self.falls) and _exceeds_chance(others)
+
+
+def _exceeds_chance(falls: Array) -> bool:
+    """Whether the sum of falls in held-out parts (…, F) is more than parts that differ by chance make."""
+    by_part = falls.sum(0)
+    return float(by_part.sum()) > SIGNIFICANT * float(by_part.std(ddof=1)) * np.sqrt(len(by_part))
 
 
 def _is_likelier(one: HypothesisTest, other: HypothesisTest) -> bool:
