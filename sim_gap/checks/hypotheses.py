@@ -13,7 +13,7 @@ from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.sound_arm import ChannelMotion
+from sim_gap.checks.sound_arm import ERROR_STD, ChannelMotion
 
 LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
@@ -24,8 +24,6 @@ UNIT_FACTORS = np.geomspace(1e-3, 2e3, 32)
 """Numbers that may be recorded of one newton metre: a torque constant with a gear or without, mA."""
 ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
-ZERO_OFFSETS = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3)
-"""Errors of a position's zero that are an effect of an arm [rad]."""
 POSITION_CHOICES = 4
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
 STATEMENTS = {"sign": "sign", "unsigned": "sign", "zero": "zero", "scale": "units"}
@@ -110,7 +108,7 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
 
 def zero_offsets(arm: RigidArm) -> Iterator[Hypothesis]:
     """Zeros of the positions that are off as far as those of sound arms are."""
-    for j, angle in product(range(arm.n), ZERO_OFFSETS):
+    for j, angle in product(range(arm.n), np.linspace(-ERROR_STD, ERROR_STD, 7).tolist()):
         what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
         yield Hypothesis("zero", ("q",), (j,), what, "", change, of_arm=True)
 

@@ -77,14 +77,13 @@ def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     model, weight = s.arm.carried(q, v, a), s.arm.gravity_torque(q)
     parts = np.hypot(weight.std(0), (model - weight).std(0)) / np.maximum(model.std(0), SMALLEST_TORQUE)
     least = np.hypot(s.noise[channel], LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE) * np.maximum(parts, 1.0))
-    duration = float(t[-1] - t[0])
-    count = measurements(q, v, size, duration)
+    count = measurements(q, v, size, duration := float(t[-1] - t[0]))
     return ChannelMotion(q, v, a, reading, channel, duration, size, count, least, idle, rubs)
 
 
 ERROR_STD = 0.3
 """Standard deviation of gains, masses, springs and offsets of sound arms, as a share of what they change; of the
-direction of gravity [rad]."""
+direction of gravity and of zeros [rad]."""
 BEARING_FRICTION_STD = 0.01
 """The same of the friction that sensors on the links feel, over the torque of the arm stretched out: 0.3 N·m of 72 on
 Panda, 0.2 of 79 on LWR4+; bearings and seals differ from joint to joint."""
@@ -281,11 +280,10 @@ def _fit(
     acting = tuple(np.concatenate([j * width + alone, common]) for j in range(n))
     columns = (-np.vstack([own[j], shared[:, j]]) for j in range(n))
     squares, products, totals, counts = fold_sums(columns, reading, weight, fold)
-    floor = motion.least
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(
-        none, acting, squares, products, totals, counts, floor**2, floor, none,
+        none, acting, squares, products, totals, counts, motion.least**2, motion.least, none,
         1.0 / spread**2, none, low, high,
     )  # fmt: skip
     every = range(len(spread))
@@ -293,7 +291,7 @@ def _fit(
     usual = 0.5 * terms.prior * terms.fit(every) ** 2
     by_joint = usual[: n * width].reshape(n, width).sum(1) + usual[n * width :].sum() / n
     left = np.stack([terms.left(terms.fit(every, f), f) for f in range(FOLDS)], axis=1)
-    size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + floor[:, None] ** 2)
+    size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + motion.least[:, None] ** 2)
     share = size / np.maximum(motion.size, SMALLEST_TORQUE)[:, None]
     return np.asarray(terms.counts * np.log(share) + by_joint[:, None] / FOLDS)
 
