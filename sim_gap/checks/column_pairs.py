@@ -9,6 +9,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
+from gcomp.estimate.choice import PRICE
 from sim_gap.checks.finding import Kind, RecordingFinding, exchange_option
 
 SAME, ALIKE, APART = 0.9, 0.7, 0.5
@@ -121,13 +122,16 @@ def _delay(recording: Recording, velocity: Array, pairs: ColumnPairs) -> float:
     rate, period = np.gradient(recording.position, recording.t, axis=0), float(np.median(np.diff(recording.t)))
     there = np.isfinite(rate).all(axis=1) & np.isfinite(velocity).all(axis=1)
     same = pairs.judged & (np.diag(pairs.match) > SAME)
-    rate, velocity = rate[there][:, same], velocity[there][:, same]
+    rate, velocity = rate[there][:, same], velocity[there][:, same] / pairs.slope[same]
     if not same.any():
         return 0.0
     longest = max(2, min(len(rate) // 4, round(0.3 / period)))
-    match = [float((rate[: len(rate) - k] * velocity[k:]).sum(0) @ (1.0 / (rate**2).sum(0))) for k in range(longest)]
-    rows = int(np.argmax(match))
-    return rows * period if rows > LATE_ROWS and rows * period > LATE_S else 0.0
+    size = np.sqrt(np.mean(rate**2, axis=0))
+    off = lambda k: (((velocity[k:] - rate[: len(rate) - k]) / size) ** 2).sum(1)  # noqa: E731
+    rows = int(np.argmin([off(k).mean() for k in range(longest)]))
+    better = off(0)[rows:] - off(rows)
+    chance = np.sqrt(2.0 * (PRICE + np.log(longest))) * better.std() / np.sqrt(len(better))
+    return rows * period if better.mean() > chance and rows > LATE_ROWS and rows * period > LATE_S else 0.0
 
 
 def require_commands(recordings: Sequence[Recording], label: str, stated: Corrections) -> None:

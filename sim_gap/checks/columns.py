@@ -15,7 +15,7 @@ from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
+from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order, zero_offsets
 from sim_gap.checks.sound_arm import CERTAIN_COST, ChannelMotion, likelihood, quick_costs
 
 SCREENING_ROWS = 150
@@ -24,8 +24,8 @@ MOST_CANDIDATES = 8
 """Hypotheses that are looked at closely, and orders from which exchanges go on."""
 ORDER_ROWS = 30
 """Rows on which orders are compared."""
-DISTINCT_FALL = 3.0 * PRICE
-"""Fall from which one correction is likelier than another: errors of sound models alone make a wrong order cheaper."""
+DECISIVE_FALL, MOST_OF_A_READING = 1.5 * PRICE, 2.0 * PRICE
+"""Fall from which one correction is likelier than another, odds of 400; most that one reading counts for."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
 
@@ -36,7 +36,7 @@ class HypothesisTest:
 
     hypothesis: Hypothesis
     falls: Array
-    """Fall of the cost of each joint in each held-out part, less its share of the price, (n, F)."""
+    """Fall of the cost of each reading in each held-out part, less its share of the price, (n, F)."""
     least: float
     """Fall that makes it certain."""
 
@@ -48,24 +48,22 @@ class HypothesisTest:
     def is_certain(self) -> bool:
         """Whether nothing but the fault can be the reason; what all joints have in common must show without the joint
         that shows it most."""
-        by_joint = self.falls.sum(1)
-        common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
-        alone = common and self.fall < float(by_joint.max())
-        return not alone and _exceeds(self.falls.sum(0), self.least)
+        common = len(self.falls) > 1 and self.hypothesis.kind in ("clock", "effort_source")
+        others = np.delete(self.falls, self.falls.sum(1).argmax(), axis=0) if common else self.falls
+        return self.fall > self.least and _exceeds_chance(self.falls) and _exceeds_chance(others)
 
 
-def _exceeds(falls: Array, least: float) -> bool:
-    """Whether the falls in held-out parts (F,) are more than that, and than chance."""
-    return bool(falls.sum() > max(least, SIGNIFICANT * falls.std(ddof=1) * np.sqrt(len(falls))))
+def _exceeds_chance(falls: Array) -> bool:
+    """Whether the sum of falls in held-out parts (…, F) is more than parts that differ by chance make."""
+    by_part = falls.sum(0)
+    return float(by_part.sum()) > SIGNIFICANT * float(by_part.std(ddof=1)) * np.sqrt(len(by_part))
 
 
-def _is_likelier(falls: Array) -> bool:
-    """Whether one correction is likelier than another by the fall of each joint's cost in each held-out part, (n, F).
-
-    Were it right, no joint would find the other one likelier by c but with a probability of exp(−c), by Markov's
-    inequality for a ratio of likelihoods. Where one does, the model of a sound arm holds for neither.
-    """
-    return _exceeds(falls.sum(0), DISTINCT_FALL) and bool(falls.sum(1).min() > -DISTINCT_FALL)
+def _is_likelier(one: HypothesisTest, other: HypothesisTest) -> bool:
+    """Whether one correction is likelier than another by all readings, each of which may be one that no model of a
+    sound arm explains."""
+    by_reading = (one.falls - other.falls).sum(1)
+    return float(np.clip(by_reading, -MOST_OF_A_READING, MOST_OF_A_READING).sum()) > DECISIVE_FALL
 
 
 def find_wrong_columns(
@@ -85,19 +83,18 @@ def find_wrong_columns(
         possible += _likely_orders(arm, motion, follows)
     falls = _quick_falls(arm, motion, possible)
     likely = [*(each for each in possible if each.option in known), *_likeliest(possible, falls)]
+    offsets = list(zero_offsets(arm))
+    likely.append(offsets[int(_quick_falls(arm, motion, offsets).argmax())])
     tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
     tests = [test for test in tests if test.is_certain]
     if not tests:
         return None
-    best = max(tests, key=lambda test: test.fall)
-    as_good = [test for test in tests if not _is_likelier(best.falls - test.falls)]
-    plainest = best
-    if best.hypothesis.kind != "scale":  # a unit is that of a channel
-        plainest = min(
-            (test for test in as_good if _contains(best, test)), key=lambda test: len(test.hypothesis.joints)
-        )
-    rivals = [test for test in as_good if not (_contains(test, plainest) or _contains(plainest, test))]
-    return _finding(arm, plainest, rivals)
+    most = max(test.fall for test in tests)
+    best = min((test for test in tests if np.isclose(test.fall, most)), key=lambda test: len(test.hypothesis.joints))
+    rivals = [test for test in tests if not (np.allclose(best.falls, test.falls) or _is_likelier(best, test))]
+    if any(test.hypothesis.of_arm for test in (best, *rivals)):
+        return None
+    return _finding(arm, best, rivals)
 
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
@@ -127,16 +124,12 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
     gone = np.isnan(changed.reading) & ~np.isnan(motion.reading)
     if gone.any():  # both are judged on the same rows
         before = likelihood(arm, replace(motion, reading=np.where(gone, np.nan, motion.reading))).costs
-    falls = before - likelihood(arm, changed).costs
+    after = likelihood(arm, changed).costs
+    if hypothesis.readings:
+        after = after[np.argsort(hypothesis.readings)]
+    falls = before - after
     price = 0.0 if known else PRICE * hypothesis.choices
     return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_COST)
-
-
-def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
-    """Whether a correction is another one, or that and the same at further joints, of which nothing shows."""
-    own, other = more.hypothesis, less.hypothesis
-    alike = own.kind == other.kind and own.channels == other.channels
-    return own is other or (alike and set(own.joints) > set(other.joints))
 
 
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:

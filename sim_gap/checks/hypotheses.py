@@ -13,7 +13,7 @@ from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
 from gcomp.estimate.choice import REWEIGHINGS
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.sound_arm import ChannelMotion, measurements
+from sim_gap.checks.sound_arm import ERROR_STD, ChannelMotion
 
 LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
@@ -47,6 +47,10 @@ class Hypothesis:
     """Number of things that are chosen in it, each as rare as an effect of the library."""
     corrects: bool = True
     """Whether the option can be carried out as it stands."""
+    readings: tuple[int, ...] = ()
+    """Which reading each joint has then, if not its own."""
+    of_arm: bool = False
+    """Whether this is an effect of the arm, which the diagnosis finds by itself."""
 
 
 def hypotheses(
@@ -100,6 +104,13 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
         text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
         what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
         yield Hypothesis("zero", ("q",), (j,), what, text, change, POSITION_CHOICES)
+
+
+def zero_offsets(arm: RigidArm) -> Iterator[Hypothesis]:
+    """Zeros of the positions that are off as far as those of sound arms are."""
+    for j, angle in product(range(arm.n), np.linspace(-ERROR_STD, ERROR_STD, 7).tolist()):
+        what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])
+        yield Hypothesis("zero", ("q",), (j,), what, "", change, of_arm=True)
 
 
 def _units(arm: RigidArm, motion: ChannelMotion) -> Iterator[Hypothesis]:
@@ -174,7 +185,7 @@ def exchangeable(
 ) -> list[tuple[tuple[str, ...], list[int]]]:
     """Channels whose columns may be in another order, and the joints: of torques or positions alone only those that
     are judged, or the readings that count would not be the same before and after."""
-    positions, judged = ("q", *follows), np.flatnonzero(measurements(motion)).tolist()
+    positions, judged = ("q", *follows), np.flatnonzero(motion.count).tolist()
     return [((*positions, motion.channel), [*range(arm.n)]), (positions, judged), ((motion.channel,), judged)]
 
 
@@ -196,7 +207,8 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
         motion = _positions(motion, order) if "q" in channels else motion
         return _torques(motion, order) if torque in channels else motion
 
-    return Hypothesis("order", tuple(channels), touched, what, option, change, choices=len(touched) - 1)
+    readings = order if torque in channels else ()
+    return Hypothesis("order", tuple(channels), touched, what, option, change, len(touched) - 1, readings=readings)
 
 
 def _positions(
@@ -211,8 +223,9 @@ def _positions(
 def _torques(motion: ChannelMotion, order: Sequence[int] | None = None, factor: Array | float = 1.0) -> ChannelMotion:
     """The motion with readings in another order, unit or sign."""
     every = list(range(motion.q.shape[1]) if order is None else order)
-    size = np.abs(factor) * motion.size[every]
-    return replace(motion, reading=factor * motion.reading[:, every], size=size, idle=motion.idle[every])
+    size, least = (np.abs(factor) * x[every] for x in (motion.size, motion.least))
+    read, count, idle = factor * motion.reading[:, every], motion.count[every], motion.idle[every]
+    return replace(motion, reading=read, size=size, count=count, least=least, idle=idle)
 
 
 def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:

@@ -35,6 +35,10 @@ class ChannelMotion:
     """Time from the first row to the last [s]."""
     size: Array
     """Standard deviation of what is recorded, in the unit of the reading, (n,): of a torque in another unit, say."""
+    count: Array
+    """Independent measurements of each reading, (n,)."""
+    least: Array
+    """Least that models of sound arms leave of each reading, standard deviation (n,)."""
     idle: Mask
     """Whether each reading may have nothing of the model's torque, (n,): of a motor that is idle, a dead sensor."""
     rubs: bool = True
@@ -63,20 +67,26 @@ def _telling(v: Array, reading: Array, of_sensor: Mask | bool) -> Mask:
 
 def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     """The compared rows of a recording, thinned to about `ROWS`. A sensor on the link feels no gear; where the motor's
-    torque is recorded too, what it feels is behind it."""
+    torque is recorded too, what it feels is behind it. Models leave the noise and a share of the torques of gravity and
+    inertia, which may be more than their sum."""
     t = s.filtered(s.t)
     thin = slice(None, None, max(1, len(t) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
     size, idle = reading.std(0), np.ones(reading.shape[1], bool)
     rubs = channel != "tau" or "tau_motor" in s.reading
-    return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, idle, rubs)
+    model, weight = s.arm.carried(q, v, a), s.arm.gravity_torque(q)
+    parts = np.hypot(weight.std(0), (model - weight).std(0)) / np.maximum(model.std(0), SMALLEST_TORQUE)
+    least = np.hypot(s.noise[channel], LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE) * np.maximum(parts, 1.0))
+    count = measurements(q, v, size, duration := float(t[-1] - t[0]))
+    return ChannelMotion(q, v, a, reading, channel, duration, size, count, least, idle, rubs)
 
 
 ERROR_STD = 0.3
 """Standard deviation of gains, masses, springs and offsets of sound arms, as a share of what they change; of the
-direction of gravity [rad]."""
-BEARING_FRICTION_STD = 0.03
-"""The same of the friction that sensors on the links feel, over the largest torque of the arm."""
+direction of gravity and of zeros [rad]."""
+BEARING_FRICTION_STD = 0.01
+"""The same of the friction that sensors on the links feel, over the torque of the arm stretched out: 0.3 N·m of 72 on
+Panda, 0.2 of 79 on LWR4+; bearings and seals differ from joint to joint."""
 LEAST_RESIDUAL = 0.14
 """Least share of a reading's standard deviation that models of sound arms leave, with these effects."""
 MEASUREMENTS_PER_STROKE, MOST_MEASUREMENTS = 6.0, 100.0
@@ -111,20 +121,15 @@ ROWS_AT_ONCE = 60_000
 """Rows of all motions that are fitted in one array."""
 
 
-def measurements(motion: ChannelMotion) -> Array:
-    """Independent measurements of each joint, (n,): by the way that the joints make, in strokes; none of one that
-    hardly moves, or whose reading never changes."""
-    return _measurements(motion.q, motion.v, motion.size, motion.duration)
-
-
-def _measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
-    """The same of motions with as many rows: q, v (…, K, n), size (…, n); (…, n)."""
-    stroke = 2.0 * q.std(-2)
-    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=-2) > SMALLEST_MOVING_SHARE)
+def measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
+    """Independent measurements of each joint (n,), by the way that the joints make, in strokes; none of one that hardly
+    moves (q, v (K, n)) or whose reading (of standard deviation `size`) never changes."""
+    stroke = 2.0 * q.std(0)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > CREEP, axis=0) > SMALLEST_MOVING_SHARE)
     strokes = np.where(moving, 1.0 / np.maximum(stroke, SMALLEST_STROKE), 0.0)
-    squares = ((v * strokes[..., None, :]) ** 2).sum(-1) / np.maximum(moving.sum(-1), 1)[..., None]
-    count = np.minimum(MEASUREMENTS_PER_STROKE * np.sqrt(squares).mean(-1) * duration, MOST_MEASUREMENTS)
-    return np.asarray(count[..., None] * (moving & (size > SMALLEST_TORQUE)))
+    squares = ((v * strokes) ** 2).sum(1) / max(int(moving.sum()), 1)
+    count = min(MEASUREMENTS_PER_STROKE * float(np.sqrt(squares).mean()) * duration, MOST_MEASUREMENTS)
+    return np.asarray(count * (moving & (size > SMALLEST_TORQUE)))
 
 
 def _own_columns(
@@ -140,7 +145,7 @@ def _own_columns(
     rubbing = np.maximum(np.stack([x.std(-2) for x in own[JOINT_EFFECTS - FRICTION_EFFECTS :]], axis=-1), 1e-9)
     most = np.maximum(arm.stretched_torque, size.max(-1, keepdims=True))
     pulled = np.maximum(size, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
-    friction = np.where(rubs[..., None], most, BEARING_FRICTION_STD * size.max(-1, keepdims=True))[..., None] / rubbing
+    friction = most[..., None] * np.where(rubs, 1.0, BEARING_FRICTION_STD)[..., None, None] / rubbing
     usual = ERROR_STD * np.stack([size, pulled, pulled], axis=-1)
     return columns, np.concatenate([usual, friction], axis=-1)
 
@@ -153,9 +158,9 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) 
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    q, v, a, read, size, idle, rubs = (
+    q, v, a, read, size, count, floor, idle, rubs = (
         np.array([getattr(motion, name) for motion in motions])
-        for name in ("q", "v", "a", "reading", "size", "idle", "rubs")
+        for name in ("q", "v", "a", "reading", "size", "count", "least", "idle", "rubs")
     )
     telling = _telling(v, read, np.array([motion.channel == "tau" for motion in motions])[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
@@ -163,8 +168,6 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
-    count = _measurements(q, v, size, motions[0].duration)
-    floor = LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
     turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
@@ -272,16 +275,15 @@ def _fit(
     spread = np.concatenate([own_spread.ravel(), shared_spread])
     read = np.cumsum(np.isfinite(motion.reading).any(1))
     fold = np.maximum(read - 1, 0) * FOLDS // read[-1]
-    weight = telling.T * (measurements(motion) / np.maximum(telling.sum(0), 1) * counted)[:, None]
+    weight = telling.T * (motion.count / np.maximum(telling.sum(0), 1) * counted)[:, None]
     alone, common = np.arange(width), n * width + np.arange(len(shared))
     acting = tuple(np.concatenate([j * width + alone, common]) for j in range(n))
     columns = (-np.vstack([own[j], shared[:, j]]) for j in range(n))
     squares, products, totals, counts = fold_sums(columns, reading, weight, fold)
-    floor = LEAST_RESIDUAL * np.maximum(motion.size, SMALLEST_TORQUE)
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(
-        none, acting, squares, products, totals, counts, floor**2, floor, none,
+        none, acting, squares, products, totals, counts, motion.least**2, motion.least, none,
         1.0 / spread**2, none, low, high,
     )  # fmt: skip
     every = range(len(spread))
@@ -289,7 +291,7 @@ def _fit(
     usual = 0.5 * terms.prior * terms.fit(every) ** 2
     by_joint = usual[: n * width].reshape(n, width).sum(1) + usual[n * width :].sum() / n
     left = np.stack([terms.left(terms.fit(every, f), f) for f in range(FOLDS)], axis=1)
-    size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + floor[:, None] ** 2)
+    size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + motion.least[:, None] ** 2)
     share = size / np.maximum(motion.size, SMALLEST_TORQUE)[:, None]
     return np.asarray(terms.counts * np.log(share) + by_joint[:, None] / FOLDS)
 

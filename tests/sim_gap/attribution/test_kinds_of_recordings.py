@@ -11,7 +11,7 @@ from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.api import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.checks.check import check_recording
+from sim_gap.checks.check import check_recording, check_recordings
 from sim_gap.model.load import load_model
 
 N = model().nv
@@ -52,10 +52,11 @@ def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
         whole.append(replace(made, torque=None))
         gravity = arm.torque(made.position, still, still)
         parts.append(replace(made, torque=None, motor_torque=made.motor_torque - gravity))
-    corrected, (finding,) = check_recording(arm, parts[0], "r", AS_IT_IS)
+    corrected, (finding,) = check_recordings(arm, parts, ["a", "b"], AS_IT_IS)
     assert finding.corrected
     assert finding.option == "--effort-is without-gravity"
-    np.testing.assert_allclose(corrected.motor_torque, whole[0].motor_torque, atol=1e-9)
+    for own, right in zip(corrected, whole, strict=True):
+        np.testing.assert_allclose(own.motor_torque, right.motor_torque, atol=1e-9)
     answer = diagnose(model(), parts[:1], parts[1:])
     assert values(answer, "friction.coulomb", "torque") == pytest.approx(coulomb, rel=0.1, abs=0.05)
     assert values(answer, "friction.viscous", "damping") == pytest.approx(viscous, rel=0.15, abs=0.35)

@@ -15,7 +15,7 @@ from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.columns import find_wrong_columns
-from sim_gap.checks.sound_arm import ChannelMotion
+from sim_gap.checks.sound_arm import LEAST_RESIDUAL, ChannelMotion, measurements
 from sim_gap.model.load import load_model
 
 REAL = Wrong(
@@ -45,7 +45,9 @@ def check(arm, recording, stated=AS_IT_IS):
 
 def wrong_columns(arm, q, v, a, reading):
     """The finding on a motor's torque over 30 s."""
-    channel = ChannelMotion(q, v, a, reading, "tau_motor", 30.0, reading.std(0), np.ones(3, bool))
+    size = reading.std(0)
+    count = measurements(q, v, size, 30.0)
+    channel = ChannelMotion(q, v, a, reading, "tau_motor", 30.0, size, count, LEAST_RESIDUAL * size, np.ones(3, bool))
     return find_wrong_columns(arm, channel, AS_IT_IS, ())
 
 

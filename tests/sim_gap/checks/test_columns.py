@@ -21,9 +21,9 @@ MOTION = motion(3, SECONDS, RATE, seed=3)
 
 def channel(reading: np.ndarray, source: str = "tau_motor", moved=MOTION) -> ChannelMotion:
     t, q, v, a = moved
-    return ChannelMotion(
-        q, v, a, reading, source, float(t[-1] - t[0]), reading.std(0), np.ones(3, bool), source != "tau"
-    )
+    size, idle, duration = reading.std(0), np.ones(3, bool), float(t[-1] - t[0])
+    count, least = measurements(q, v, size, duration), LEAST_RESIDUAL * size
+    return ChannelMotion(q, v, a, reading, source, duration, size, count, least, idle, source != "tau")
 
 
 def found(read: ChannelMotion, stated=AS_IT_IS) -> RecordingFinding | None:
@@ -47,7 +47,7 @@ def shifted(reading: np.ndarray, by_s: float | np.ndarray) -> np.ndarray:
 def test_a_sound_channel_is_explained_to_the_floor_of_what_models_leave():
     read = channel(sound(friction=0.3))
     assert found(read) is None
-    share = np.exp(likelihood(ARM, read).costs.sum(1) / measurements(read))
+    share = np.exp(likelihood(ARM, read).costs.sum(1) / read.count)
     np.testing.assert_array_less(share, 1.3 * LEAST_RESIDUAL)
 
 

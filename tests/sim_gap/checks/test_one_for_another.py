@@ -79,7 +79,7 @@ def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by
 def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     arm, recording = arms["panda"]
     torque = recording.torque.copy()
-    torque[:, joint] *= 10.0
+    torque[:, joint] *= 30.0  # as much as ten may be the friction of a bearing
     column = f"tau_{joint + 1}"
     doubt(
         check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS),
