@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.output import write_json
+from armlink.errors import BadInput
 from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
@@ -90,9 +92,7 @@ def new(
     Example: armlink new arm.urdf --out arm.yaml
     """
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
-    from armlink.errors import BadInput
     from armlink.loop.open import first_check
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
@@ -185,7 +185,6 @@ def _hand(bus: str, by_hand: bool | None, interactive: bool) -> "Ask | None":
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:
     from armlink.commands.plain_console import confirm
-    from armlink.errors import BadInput
 
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise BadInput(f"--out {out}: expected a file that ends in .yaml")
