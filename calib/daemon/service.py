@@ -157,12 +157,12 @@ class Service:
         configuration.arm, configuration.settings = arm, settings
         try:
             if settings.observer != before[1].observer:
-                self._renew()
+                self.save()
+                self.records.renew()
         except Exception:
             configuration.arm, configuration.settings = before
             raise
-        evidence = {"policy": settings.policy}
-        self.events.say("configuration", None, "the configuration was reloaded", evidence)
+        self.events.say("configuration", None, "the configuration was reloaded", {"policy": settings.policy})
         self.records.load()
         if self.records.observation is not None:
             feed = self.records.observation.feed
@@ -200,10 +200,6 @@ class Service:
         if isinstance(found, Exception):
             raise found
         self.report = found
-
-    def _renew(self) -> None:
-        self.save()
-        self.records.renew()
 
     def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> ActiveObservation:
         """An observation against these records, continued from the saved state if that fits; raises Refused."""

@@ -156,23 +156,20 @@ class StepPass(SweepPass):
                     standing = True
                 rest = self._step(sweep, *sweep.target(index))
             except Stall as stall:
-                standing, detour = False, True
                 self.bridge(stall, f"{sweep.name} {index + 1}")
-                continue
             except Slipped as slip:
                 retries += 1
-                standing, detour = False, True
                 sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
-                continue
             except Stalled:
                 retries += 1
-                standing, detour = False, True
                 self.acceleration *= SLOWER
                 if retries > RETRIES:
                     raise
+            else:
+                self._save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
+                open_readings.pop(0)
                 continue
-            self._save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
-            open_readings.pop(0)
+            standing, detour = False, True
 
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
         """Bring the resting joints to their places, and press or hold them there; as a `detour`, by way of a pose known
