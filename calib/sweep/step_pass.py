@@ -31,14 +31,8 @@ def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess
     """The rough gravity model from the scout's readings among `readings`."""
     scouted = [reading for reading in readings if reading.sweep == SCOUT]
     limits, section = DriveLimits.of(arm), sweep_section(arm)
-    return guess_gravity(
-        gcomp_arm(arm),
-        stack(scouted, "position"),
-        stack(scouted, "torque"),
-        stack(scouted, "motor_torque"),
-        limits.rated,
-        section.friction,
-    )
+    position, torque, motor = (stack(scouted, channel) for channel in ("position", "torque", "motor_torque"))
+    return guess_gravity(gcomp_arm(arm), position, torque, motor, limits.rated, section.friction)
 
 
 STOP_DISTANCE = 0.02
