@@ -157,8 +157,7 @@ class Service:
         configuration.arm, configuration.settings = arm, settings
         try:
             if settings.observer != before[1].observer:
-                self.save()
-                self.records.renew()
+                self._renew()
         except Exception:
             configuration.arm, configuration.settings = before
             raise
@@ -200,6 +199,10 @@ class Service:
         if isinstance(found, Exception):
             raise found
         self.report = found
+
+    def _renew(self) -> None:
+        self.save()
+        self.records.renew()
 
     def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> ActiveObservation:
         """An observation against these records, continued from the saved state if that fits; raises Refused."""
