@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -274,7 +274,9 @@ class DataWriter:
         except BadInput:
             self._file.close()
             raise
-        self._drop_torn_line()
+        self._file.seek(0)
+        content = self._file.read()
+        self._file.truncate(content.rfind(b"\n") + 1)  # a torn line goes
         _keep_names(path)
 
     def append(self, line: Line) -> None:
@@ -295,11 +297,6 @@ class DataWriter:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-
-    def _drop_torn_line(self) -> None:
-        self._file.seek(0)
-        content = self._file.read()
-        self._file.truncate(content.rfind(b"\n") + 1)
 
 
 def _keep_names(path: Path) -> None:
@@ -340,13 +337,12 @@ def _check_width(reading: StaticReading, n: int, path: Path) -> None:
 
 
 def _require_same(found: Manifest, wanted: Manifest, path: Path) -> None:
-    differing: dict[str, tuple[Any, Any]] = {
-        key: (getattr(found, key), getattr(wanted, key))
-        for key in ("arm", "serial", "description_hash", "reference_mass", "installed_gain", "installed_offset")
-        if getattr(found, key) != getattr(wanted, key)
-    }
-    for key, (ours, theirs) in differing.items():
-        raise Refused(f"{path}: {key} was {ours}, but now it is {theirs}: resume with the same arm and the same mass")
+    for key in ("arm", "serial", "description_hash", "reference_mass", "installed_gain", "installed_offset"):
+        before, now = getattr(found, key), getattr(wanted, key)
+        if before != now:
+            raise Refused(
+                f"{path}: {key} was {before}, but now it is {now}: resume with the same arm and the same mass"
+            )
 
 
 log = logging.getLogger(__name__)

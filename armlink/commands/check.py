@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, Json, OtherBus
+from armlink.commands.output import write_json
+from armlink.errors import BadInput, BusFault, Refused
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,9 +65,7 @@ def check(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.early_end import early_end, joints_left
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, confirm, results, suggest
-    from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
     from armlink.loop.open import open_arm
     from armlink.selftest.self_test import announcement, self_test
@@ -118,9 +118,7 @@ def _check_scales(
 ) -> int:
     """Judge the scales of readings; asks before this host moves the arm. Raises Refused where one is off."""
     from armlink.commands.early_end import early_end
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import confirm, results
-    from armlink.errors import BadInput, Refused
     from armlink.loop.open import is_in_process
 
     if how not in ("hand", "move", "listen"):
@@ -190,9 +188,7 @@ def _scales_answer(each: "JointScales") -> dict[str, Any]:
 
 def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path | None) -> int:
     """Lateness of this machine's cycle at the arm's rate, and the rate that it holds."""
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
-    from armlink.errors import Refused
     from armlink.link.lateness import WARN_SHARE
     from armlink.selftest.host import measure_host
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Json, OtherBus
+from armlink.commands.output import write_json
+from armlink.errors import BadInput, BusFault, Refused
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,10 +27,8 @@ def scan(
     Example: armlink scan sarcos --bus socketcan:vcan0
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.drives.family import family
-    from armlink.errors import BadInput
     from armlink.loop.open import first_check
 
     if arm is None:
@@ -50,7 +50,6 @@ def scan(
 def _look_for_all(bus: str, json: Path | None) -> int:
     from armlink.arm_file import Bus
     from armlink.bus.open import open_bus
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.drives.discovery import BusDrives
 
@@ -74,9 +73,7 @@ def _look_for_all(bus: str, json: Path | None) -> int:
 
 
 def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
-    from armlink.errors import BusFault, Refused
     from armlink.link.joints.groups import traits_of
     from armlink.link.link import Link
 

@@ -151,10 +151,7 @@ def _of_steps(fit: "SensorFit") -> dict[str, Any]:
         "gain_ratio": None if fit.gain_ratio is None else fit.gain_ratio.tolist(),
         "hysteresis": fit.hysteresis.tolist(),
         "friction": fit.friction.tolist(),
-        "findings": [
-            {"joint": found.joint, "kind": found.kind, "size": found.size, "unit": found.unit, "text": found.text}
-            for found in fit.findings
-        ],
+        "findings": [vars(found) for found in fit.findings],
         "doubtful": list(fit.doubtful),
         "discrepancy": [
             {"joint": name, **each.model_dump()} for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from armlink.commands.options import LeRobot, Ros2
+from armlink.errors import BadInput
 from calib.commands.options import Store
 
 TAKE_OVER_SECONDS = 3.0
@@ -63,7 +64,6 @@ def daemon(
     from armlink.arm_file import load_arm
     from armlink.bus.open import is_listening, resolve_bus
     from armlink.commands.options import stated_bus
-    from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.daemon.logs import log_to_stderr
     from calib.daemon.settings import Options, state_directory
@@ -104,8 +104,6 @@ def daemon(
 
 
 def _token(path: Path | None) -> str | None:
-    from armlink.errors import BadInput
-
     if path is None:
         return None
     try:
@@ -118,8 +116,6 @@ def _token(path: Path | None) -> str | None:
 
 
 def _address(text: str, token: str | None) -> tuple[str, int]:
-    from armlink.errors import BadInput
-
     host, colon, port = text.rpartition(":")
     if not (colon and host and port.isdigit() and 0 < int(port) < 65536):
         raise BadInput(f"--tcp {text}: expected HOST:PORT, for example 127.0.0.1:8080")

@@ -69,14 +69,8 @@ def _show(
         if each.before is None and each.after is None:
             continue
         striking = each.deviations is not None and abs(each.deviations) >= STRIKING
-        cells = (_text(each.before, ".5f"), _text(each.after, ".5f"), _text(each.change, "+.5f"))
-        deviations = _text(each.deviations, "+.1f")
-        row = (each.joint, each.parameter.replace("_", " "), each.unit, *cells, deviations)
+        row = (each.joint, each.parameter.replace("_", " "), each.unit, *each.texts)
         table.add_row(*row, style="bold" if striking else None)
         count += striking
     console.print(table)
     console.print(f"{count} of {table.row_count} values changed by at least {STRIKING:g} standard deviations")
-
-
-def _text(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import LeRobot, OtherBus, Ros2, reads_recordings
+from armlink.commands.output import write_json
+from armlink.errors import BadInput
 from calib.commands.options import ArmOrModel, ChainBase, ChainTip, JsonFile, Store, Tool
 
 if TYPE_CHECKING:
@@ -77,9 +79,7 @@ def external(
     import numpy as np
 
     from armlink.commands.options import stated_bus
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
-    from armlink.errors import BadInput
     from armlink.recording.files import load_recordings
     from calib.external.arm_model import SHORTEST, listener_of
     from calib.external.listening import Learned, listen, load_learned, save_learned
@@ -161,7 +161,6 @@ def external(
 
 def parse_rate(text: str) -> float:
     """Events an hour of `1/h` or `2/d`; raises BadInput."""
-    from armlink.errors import BadInput
 
     number, _, unit = text.partition("/")
     hours = {"h": 1.0, "d": 24.0, "min": 1.0 / 60.0}
@@ -178,7 +177,6 @@ def parse_frame(text: str | None, records: "ArmRecords") -> "WrenchFrame":
     """The frame of an option `--frame`; raises BadInput."""
     import numpy as np
 
-    from armlink.errors import BadInput
     from calib.external.listening import WrenchFrame
 
     arm, file = records.stated.arm, records.stated.arm_file

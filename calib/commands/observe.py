@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, LeRobot, OtherBus, Ros2
+from armlink.commands.output import write_json
+from armlink.errors import BadInput
 from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
@@ -38,9 +40,7 @@ def observe(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.options import stated_bus
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
-    from armlink.errors import BadInput
     from calib.arm.kinematics import gcomp_arm
     from calib.daemon.state.events import describe, one_alarm_a_joint
     from calib.observer.observer import observer_of
@@ -88,7 +88,6 @@ def observe(
 
 def recorded(arm: "ArmFile", path: Path) -> "Iterator[tuple[float, Array, Array]]":
     """Rows of a recording: time [s], positions and torques, in the order of the arm's joints. Raises BadInput."""
-    from armlink.errors import BadInput
     from armlink.recording.files import load_recording
     from calib.fit.recorded_rows import in_joint_order
 

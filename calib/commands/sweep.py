@@ -93,17 +93,8 @@ def sweep(
         write_json(json_file, _plan(arm_file, seed, reference_mass, check_stops, picture, results(json_file)))
         simulated = bus is None and arm_file.require_link().bus.interface == SIMULATED
         folder = Path(("rehearsal-" if simulated else "") + ("loaded" if reference_mass else "unloaded"))
-        suggest(
-            command_line(
-                "sweep",
-                arm,
-                *["--dry-run"] * simulated,
-                out=new_folder(folder),
-                reference_mass=f"{reference_mass:g}" if reference_mass else None,
-                bus=bus,
-                hold=hold,
-            )
-        )
+        words, mass = [arm, *["--dry-run"] * simulated], f"{reference_mass:g}" if reference_mass else None
+        suggest(command_line("sweep", *words, out=new_folder(folder), reference_mass=mass, bus=bus, hold=hold))
         return
     if out is None:
         raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")

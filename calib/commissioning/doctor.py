@@ -54,12 +54,8 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
     try:
         yield from _drives(arm_file, opened, name)
     except ArmlinkError as error:
-        yield SetupFinding(
-            "error",
-            str(error),
-            name,
-            f"check power, wiring and bit rate; `armlink scan {arm_file.argument}` shows more",
-        )
+        more = f"check power, wiring and bit rate; `armlink scan {arm_file.argument}` shows more"
+        yield SetupFinding("error", str(error), name, more)
     finally:
         opened.shutdown()
     if bus.interface == SIMULATED:
@@ -131,12 +127,8 @@ def _absent_interface(bus: Bus) -> SetupFinding | None:
 
 def another_drive(mismatch: str, where: str) -> SetupFinding:
     """A drive that is not the one of the arm file."""
-    return SetupFinding(
-        "error",
-        mismatch,
-        where,
-        "connect the right arm, or correct the entry of this joint under link.joints of the arm file",
-    )
+    remedy = "connect the right arm, or correct the entry of this joint under link.joints of the arm file"
+    return SetupFinding("error", mismatch, where, remedy)
 
 
 def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
@@ -173,9 +165,8 @@ def _places(link: Link) -> Iterator[SetupFinding]:
         if each.joint in after:
             yield SetupFinding("error", each.what, where, each.remedy)
         else:
-            yield SetupFinding(
-                "hint", each.what, where, f"this is corrected at each start: {link.turns.note(each.joint)}"
-            )
+            corrected = f"this is corrected at each start: {link.turns.note(each.joint)}"
+            yield SetupFinding("hint", each.what, where, corrected)
 
 
 FORMATS = "docs/formats.md has every key with its unit and range"
@@ -199,9 +190,8 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
             yield SetupFinding("error", what, f"{arm}: {key}", remedy)
         return
     except ArmlinkError as error:
-        yield SetupFinding(
-            "error", str(error), arm, "correct the arm file, or make a new one from a model (see new --help)"
-        )
+        remedy = "correct the arm file, or make a new one from a model (see new --help)"
+        yield SetupFinding("error", str(error), arm, remedy)
         return
     impossible = list[SetupFinding]()
     try:
@@ -211,14 +201,13 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
             yield from model_findings(arm_file)
             yield from motion_findings(arm_file)
     except (ArmlinkError, GcompError) as error:  # what later checks rest upon
-        yield _as_finding(error, arm_file)
+        what, _, remedy = str(error).removeprefix(f"{arm_file.path}: ").rpartition(": ")
+        if not what:
+            what, remedy = remedy, "correct the arm file or its model"
+        yield SetupFinding("error", what, str(arm_file.path), remedy)
     if arm_file.link is None:
-        yield SetupFinding(
-            "error",
-            "key `link` is missing: the bus and the drives of the joints are not known",
-            arm,
-            f"add the key `link`: {FORMATS}",
-        )
+        what = "key `link` is missing: the bus and the drives of the joints are not known"
+        yield SetupFinding("error", what, arm, f"add the key `link`: {FORMATS}")
     else:
         yield from _serial(arm_file, bus)
         yield from turn_findings(arm_file)
@@ -226,13 +215,6 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)
-
-
-def _as_finding(error: Exception, arm_file: ArmFile) -> SetupFinding:
-    what, _, remedy = str(error).removeprefix(f"{arm_file.path}: ").rpartition(": ")
-    if not what:
-        what, remedy = remedy, "correct the arm file or its model"
-    return SetupFinding("error", what, str(arm_file.path), remedy)
 
 
 def _serial(arm_file: ArmFile, bus: str | None) -> Iterator[SetupFinding]:
@@ -253,9 +235,5 @@ def _assumed(arm: str, arm_file: ArmFile) -> Iterator[SetupFinding]:
         return
     assumed = assumed_lines(Path(arm_file.path).read_text(encoding="utf-8"))
     if assumed:
-        yield SetupFinding(
-            "hint",
-            f"{len(assumed)} values are marked as assumed, the first is in line {assumed[0]}",
-            str(arm_file.path),
-            "check each of these values, then remove its comment",
-        )
+        what = f"{len(assumed)} values are marked as assumed, the first is in line {assumed[0]}"
+        yield SetupFinding("hint", what, str(arm_file.path), "check each of these values, then remove its comment")

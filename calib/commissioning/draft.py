@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -173,12 +173,12 @@ def _effort_doubts(chain: Chain, need: Array) -> list[str]:
         everywhere = f"the model's effort limits are all more than {MOST_RESERVE:g} times the load"
     doubts = []
     for joint, effort in enumerate(efforts):
-        doubt = everywhere
         if effort is None:
-            doubt = "the model states no effort limit"
-        elif not doubt and joint in short:
-            doubt = f"the model's effort limit of {effort:g} N·m is less than the load"
-        doubts.append(doubt)
+            doubts.append("the model states no effort limit")
+        elif joint in short and not everywhere:
+            doubts.append(f"the model's effort limit of {effort:g} N·m is less than the load")
+        else:
+            doubts.append(everywhere)
     return doubts
 
 
@@ -274,8 +274,10 @@ def arm_text(draft: Draft, out: Path) -> str:
     note = f"{NO_BUS}, this is the simulated arm; for a real arm write {real}"
     lines += ["link:", yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
     lines += [yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
+    keys = ("name", "node", "rated_torque", "max_torque", "max_torque_rate", "max_velocity")
     for joint in draft.joints:
-        lines += [yaml_item(_joint_row(joint), 4), *(yaml_comment(note, 6) for note in joint.notes)]
+        row = {key: getattr(joint, key) for key in keys}
+        lines += [yaml_item(row, 4), *(yaml_comment(note, 6) for note in joint.notes)]
     if draft.servo is not None:
         lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
     lines += [
@@ -287,14 +289,3 @@ def arm_text(draft: Draft, out: Path) -> str:
     lines += [yaml_item({"effect": effect, "joint": joint, key: value}, 4) for effect, joint, key, value in effects]
     lines += [yaml_comment(note) for note in draft.notes]
     return "\n".join(lines) + "\n"
-
-
-def _joint_row(joint: JointDraft) -> dict[str, Any]:
-    return {
-        "name": joint.name,
-        "node": joint.node,
-        "rated_torque": joint.rated_torque,
-        "max_torque": joint.max_torque,
-        "max_torque_rate": joint.max_torque_rate,
-        "max_velocity": joint.max_velocity,
-    }

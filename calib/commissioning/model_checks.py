@@ -64,19 +64,14 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
     if found:
         return found
     if not arm_file.has_geometry:
+        what = "the geometry of the arm is not known, so nothing can be swept or identified"
         remedy = (
             "give a, alpha and d of every joint, or make the arm file from the arm's URDF or MJCF: armlink new --help"
         )
-        return [
-            SetupFinding(
-                "error", "the geometry of the arm is not known, so nothing can be swept or identified", where, remedy
-            )
-        ]
+        return [SetupFinding("error", what, where, remedy)]
     if (largest_levers(gcomp_arm(arm_file)) < DEAD_LEVER).all():
-        what, remedy = (
-            "gravity loads no joint in any pose, so nothing can be calibrated",
-            "incline the base, then give the inclined gravity here",
-        )
+        what = "gravity loads no joint in any pose, so nothing can be calibrated"
+        remedy = "incline the base, then give the inclined gravity here"
         return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
     return []
 
@@ -159,12 +154,8 @@ def mass_error(where: str, model: ModelArm) -> SetupFinding | None:
     if LIGHTEST < mass / length**3 < HEAVIEST:
         return None
     usual = f"arms of this size weigh {_usual(LIGHTEST, length)} to {_usual(HEAVIEST, length)} kg"
-    return SetupFinding(
-        "error",
-        f"the moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}",
-        where,
-        "write masses in kg and lengths in m",
-    )
+    what = f"the moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}"
+    return SetupFinding("error", what, where, "write masses in kg and lengths in m")
 
 
 def _usual(density: float, length: float) -> str:
@@ -194,25 +185,20 @@ def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
     where = str(arm_file.path)
     if arm_file.model_path is None:
-        yield SetupFinding(
-            "hint",
-            "collisions cannot be checked: the arm file has Denavit-Hartenberg rows and no model",
-            where,
-            "give a URDF or MJCF under kinematics.model, or keep the workspace clear",
-        )
+        what = "collisions cannot be checked: the arm file has Denavit-Hartenberg rows and no model"
+        remedy = "give a URDF or MJCF under kinematics.model, or keep the workspace clear"
+        yield SetupFinding("hint", what, where, remedy)
     else:
         yield from file_findings(arm_file)
-        yield from _massless_links(arm_file)
+        model = model_arm(arm_file)
+        lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
+        if lacking:
+            what = f"the links moved by {', '.join(lacking)} have no mass in the model"
+            remedy = (
+                "add their masses and centres of mass to the model: until then demo and torque calculate without them"
+            )
+            yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
     yield from _lever_findings(arm_file)
-
-
-def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
-    model = model_arm(arm_file)
-    lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
-    if lacking:
-        what = f"the links moved by {', '.join(lacking)} have no mass in the model"
-        remedy = "add their masses and centres of mass to the model: until then demo and torque calculate without them"
-        yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
 def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
@@ -222,32 +208,24 @@ def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     model = read_model(arm_file.model_path)
     unphysical = model.unphysical_beyond(arm_file.joint_names[0])
     if unphysical:
-        yield SetupFinding(
-            "warning",
-            f"the inertia of {', '.join(unphysical)} has a negative principal moment and is ignored",
-            where,
-            "correct it: until then the torque under acceleration of this link is not modelled",
-        )
+        what = f"the inertia of {', '.join(unphysical)} has a negative principal moment and is ignored"
+        remedy = "correct it: until then the torque under acceleration of this link is not modelled"
+        yield SetupFinding("warning", what, where, remedy)
     if model.left_out:
         reasons = {reason for _, reason in model.unused_meshes}
         remedy = "convert these meshes to binary STL or OBJ, or keep the workspace clear"
         if NOT_FOUND in reasons:
-            remedy = (
-                "put the meshes where the model names them (package://NAME/… is looked for in the folders "
-                "above the model)"
-            )
+            folders = "package://NAME/… is looked for in the folders above the model"
+            remedy = f"put the meshes where the model names them ({folders})"
         elif UNFETCHED in reasons:
             remedy = "run `git lfs pull` in the folder where the model was cloned"
         elif reasons == {FLAT}:
             remedy = "replace these meshes by boxes in the model, or keep the workspace clear"
         yield SetupFinding("warning", f"the collision geometry is incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
-        yield SetupFinding(
-            "warning",
-            "the model has no collision geometry, so collisions are not checked",
-            where,
-            "add collision shapes to the model, or keep the workspace clear",
-        )
+        what = "the model has no collision geometry, so collisions are not checked"
+        remedy = "add collision shapes to the model, or keep the workspace clear"
+        yield SetupFinding("warning", what, where, remedy)
 
 
 def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
@@ -359,12 +337,8 @@ def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     for joint in range(arm.n):
         candidates = stop_combinations(arm, joint, planned.sweep_range(joint))
         ever |= planned.pressable_joints(candidates).any(axis=0) & (np.arange(arm.n) != joint)
+    what = "this joint cannot be pressed on a stop within max_torque"
+    remedy = "hold joints at rest by their position loops (`sweep: {hold: servo}`), or allow more torque"
     for name, pressed in zip(arm.names, ever, strict=True):
-        if pressed or arm.n == 1:
-            continue
-        yield SetupFinding(
-            "warning",
-            "this joint cannot be pressed on a stop within max_torque",
-            name,
-            "hold joints at rest by their position loops (`sweep: {hold: servo}`), or allow more torque",
-        )
+        if not pressed and arm.n > 1:
+            yield SetupFinding("warning", what, name, remedy)

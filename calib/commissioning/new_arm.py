@@ -92,7 +92,6 @@ class Questions(Protocol):
 
     def stops(self, joint: ModelJoint) -> tuple[float, float] | None:
         """Stops [rad] of a joint for which the model has none; None where they are not known."""
-        ...
 
 
 @dataclass

@@ -27,7 +27,6 @@ class RunAside(Protocol):
 
     def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
         """Call `done` on the service's own thread with the value that `work` returned, or the error it raised."""
-        ...
 
 
 class Disk(RunAside, Protocol):
@@ -35,18 +34,15 @@ class Disk(RunAside, Protocol):
 
     def drain(self, seconds: float, /) -> bool:
         """Wait until all work is done, at most so long [s]; whether it is."""
-        ...
 
 
 class BusAccess(Protocol):
     @property
     def controllers(self) -> Controllers:
         """Reads and writes the calibration of every joint; waits for the answer, so only for work that runs aside."""
-        ...
 
     def move(self, controller: Controller, /) -> None:
         """Have a controller run; Stopped comes where that is not possible, Progress where it tells that."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -161,8 +161,7 @@ class Service:
         except Exception:
             configuration.arm, configuration.settings = before
             raise
-        evidence = {"policy": settings.policy}
-        self.events.say("configuration", None, "the configuration was reloaded", evidence)
+        self.events.say("configuration", None, "the configuration was reloaded", {"policy": settings.policy})
         self.records.load()
         if self.records.observation is not None:
             feed = self.records.observation.feed

@@ -136,12 +136,8 @@ class ServiceView:
         t, channels = self._service.window.rows(seconds, most)
         torque, model = self._torques(channels["position"], channels["torque"])
         late = timedelta(seconds=environment.monotonic() - float(t[-1])) if len(t) else timedelta()
-        return Window(
-            names=self._service.configuration.names,
-            time=environment.wall() - late,
-            t=t - t[:1],
-            channels=channels | {"torque": torque, "model_torque": model},
-        )
+        channels |= {"torque": torque, "model_torque": model}
+        return Window(self._service.configuration.names, environment.wall() - late, t - t[:1], channels)
 
     def arm(self) -> view.DrawnArm:
         """The arm's shape; read from its model on the first call. Raises NoSuch."""

@@ -389,11 +389,9 @@ class Decisions(Protocol):
 
         It is `approved` once that is on disk, and `applied` or `failed` a moment later (an event).
         """
-        ...
 
     def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
         """Drop a pending proposal; `digest` likewise."""
-        ...
 
 
 class Subscription(Protocol):
@@ -414,30 +412,24 @@ class DaemonView(Protocol):
 
     def joints(self) -> tuple[JointNow, ...]:
         """Every joint as of the newest snapshot, base to tip."""
-        ...
 
     def external(self) -> ExternalNow:
         """External torque as of the newest row."""
-        ...
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds` (at most 600), thinned evenly to at most `most` rows."""
-        ...
 
     def arm(self) -> DrawnArm:
         """The arm's shape, from its model; raises NoSuch if that cannot be read. May be called in any thread."""
-        ...
 
     def estimates(self) -> tuple[JointEstimate, ...]:
         """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
-        ...
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
         """At most `limit` events with an id above `after`, oldest first; ask again after the last id for more.
 
         May be called in any thread.
         """
-        ...
 
     def history_pages(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
@@ -447,10 +439,8 @@ class DaemonView(Protocol):
         Thinned evenly to at most `most` per joint; without a joint those of every joint, one after the other. From any
         thread.
         """
-        ...
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]: ...
 
     def subscribe(self) -> Subscription:
         """A new client of the stream, which begins with the present joints."""
-        ...

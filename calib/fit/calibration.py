@@ -89,11 +89,6 @@ class FitFinding:
     text: str
     """One sentence for the user."""
 
-    @property
-    def breaks_model(self) -> bool:
-        """Whether the joint's values must not be used as they are."""
-        return self.kind not in HOLDING
-
 
 class FittedCalibration(ABC):
     """Result of a fit to readings of any kind; NaN where they do not determine a value, with the cause in `reasons`."""
@@ -127,7 +122,7 @@ class FittedCalibration(ABC):
         """Why the model does not hold at a joint, in a sentence: the first finding of each such joint."""
         found: dict[str, str] = {}
         for each in self.findings:
-            if each.breaks_model:
+            if each.kind not in HOLDING:
                 found.setdefault(each.joint, each.text)
         return found
 

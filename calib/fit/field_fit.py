@@ -116,9 +116,10 @@ class FieldProblem:
 
     def load_columns(self) -> Array:
         """Change of each counted reading per unit of a payload's mass and of mass times place (P, 4)."""
-        fixed, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, joint_positions(self.sensors, self.rows))[self.rows.counted]
-        return np.asarray(regressor @ np.column_stack([fixed, by_point]) * self.installed.gain[self.joint, None])
+        return np.asarray(
+            regressor @ np.column_stack(payload_columns(self.arm)) * self.installed.gain[self.joint, None]
+        )
 
     def solve(
         self, columns: Array, noise: Array, gain_share: Array | None = None, more: Sequence[float] = ()

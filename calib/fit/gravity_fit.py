@@ -20,7 +20,7 @@ from calib.fit.sweep_readings import FEWEST, SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, HeldOutJoint, matrix, provenance
 from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
-from gcomp.identify.global_fit import GlobalFit, identify_global
+from gcomp.identify.global_fit import identify_global
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import RecursiveFit, identify_recursive
@@ -78,7 +78,11 @@ def identify_gravity(
     else:
         calibration = sensor_parameters(sensors.require(arm_file))
         _require_scale(arm_file.joint_names, np.isnan(sensors.values("gain")))
-        fit = _global(arm_file, rows, calibration)
+        unknown = {"beta", "offset"} | ({"rho"} if any(rows.masses) else set())
+        sigma = rows.position_sigma
+        fit = identify_global(
+            gcomp_arm(arm_file), rows.readings, unknown=unknown, start=calibration, position_sigma=sigma
+        )
     found = ~np.isnan(fit.values.beta)
     covariance = np.where(np.isnan(fit.beta_covariance), 0.0, fit.beta_covariance)
     residual = np.where(rows.readings.load[:, None] == 0, fit.residual, np.nan) / calibration.gain
@@ -108,14 +112,6 @@ def _recursion(arm_file: ArmFile, rows: SweepReadings, calibration: Parameters) 
         return identify_recursive(gcomp_arm(arm_file), true)
     except GcompError:
         return None
-
-
-def _global(arm_file: ArmFile, rows: SweepReadings, calibration: Parameters) -> GlobalFit:
-    """Mass moments, offsets and, with a load, its point; gains and position sensors are known."""
-    unknown = {"beta", "offset"} | ({"rho"} if any(rows.masses) else set())
-    return identify_global(
-        gcomp_arm(arm_file), rows.readings, unknown=unknown, start=calibration, position_sigma=rows.position_sigma
-    )
 
 
 def sensor_parameters(record: CalibrationRecord, **known: Array) -> Parameters:

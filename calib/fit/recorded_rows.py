@@ -50,14 +50,10 @@ def windows_of(t: Array, position: Array, torque: Array, source: str) -> tuple[S
     padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, position.shape[1]))
     steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
     means = np.array([position[each].mean(axis=0) for each in windows])
+    torques = np.array([torque[each].mean(axis=0) for each in windows])
     sigma = np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in windows])
-    found = StaticReadings(
-        means,
-        np.array([torque[each].mean(axis=0) for each in windows]),
-        np.maximum(sigma, np.finfo(float).tiny),
-        direction=directions(means),
-        velocity=slopes,
-    )
+    sigma = np.maximum(sigma, np.finfo(float).tiny)
+    found = StaticReadings(means, torques, sigma, direction=directions(means), velocity=slopes)
     acceleration = np.array([2 * np.polyfit(t[each] - t[each].mean(), position[each], 2)[0] for each in windows])
     return found, acceleration, (np.abs(slopes).max(axis=1) <= SLOW) & steady
 

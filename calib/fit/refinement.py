@@ -219,13 +219,8 @@ def refine(
     )
     certainty = np.full(len(vector), 1.0)
     certainty[problem.free] = _certainty(linear, np.nan_to_num(covariance), freedom)
-    return Refined(
-        refined,
-        factor,
-        linear,
-        linear.solution[count:],
-        Parameters.from_vector(certainty, kinematics.n),
-    )
+    sure = Parameters.from_vector(certainty, kinematics.n)
+    return Refined(refined, factor, linear, linear.solution[count:], sure)
 
 
 def _certainty(linear: Linear, covariance: Array, free: Array) -> Array:
@@ -267,7 +262,6 @@ class _Problem:
         torque = float(np.abs(readings.torque[readings.counted]).max())
         sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
         self.scale = np.concatenate([natural_units(kinematics, readings, fit.complete)[self.free], sizes])
-        self.resolution = rows.resolution
 
     def linearised(self, vector: Array, factor: Array, level: Array) -> Linear:
         """The problem linearised, and solved, at a parameter vector (6n + 3,), noise times factor (n,)."""
@@ -276,7 +270,7 @@ class _Problem:
         lag = WITHIN * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
         own = self.rows.swept[self.row] == self.joint
         sigma = np.hypot(readings.sigma[readings.counted], np.where(own, 0.0, lag)) * factor[self.joint]
-        rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])
+        rounding = _rounding_columns(readings, self.rows.resolution, slope / sigma[:, None])
         found = troubles(self.setting, self.rows, Parameters.from_vector(vector, self.arm.n))
         informed = np.flatnonzero(np.isfinite(self.std))
         count, known = len(sigma), len(informed)

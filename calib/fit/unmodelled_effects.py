@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import fdtrc
@@ -101,29 +102,21 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         here = counted[:, joint]
         if here.sum() < FEWEST:
             continue
-        angle, own = readings.position[:, joint], torque[:, joint]
-        yield _one(kinematics.n, joint, "transmission.spring", here * angle)
+        angle, own, one = readings.position[:, joint], torque[:, joint], partial(_one, kinematics.n, joint)
+        yield one("transmission.spring", here * angle)
         doubt = _lag_doubt(rows, joint)
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
-            columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).columns[0] for side in sides)
+            columns = tuple(one("torque.hysteresis", side).columns[0] for side in sides)
             yield UnmodelledEffect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
-        yield replace(
-            _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
-        )
+        yield replace(one("torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt)
         largest = float(np.abs(own[here]).max())
-        yield _one(kinematics.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
+        yield one("torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEE_SHARES:
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
-                yield _one(
-                    kinematics.n,
-                    joint,
-                    "torque.saturation",
-                    bent,
-                    share * largest / max(abs(complete.gain[joint]), 1e-9),
-                )
-        yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
+                yield one("torque.saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
+        yield one("torque.drift", here * (rows.time - rows.time.mean()))
         if float(np.ptp(angle[here])) > LEAST_ECCENTRIC_RANGE:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             yield UnmodelledEffect(joint, "position.eccentricity", turn)

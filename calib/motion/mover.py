@@ -6,6 +6,7 @@ from contextlib import closing, contextmanager
 import numpy as np
 import numpy.typing as npt
 
+from armlink.drives.orders import Mode
 from armlink.errors import Refused
 from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
@@ -44,7 +45,6 @@ COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
 """Longest time that joints may take to stop [s]; how often one looks [s]; way in that time of one that stands [rad]."""
 CHECK_CYCLES = 5
 """Cycles from one look at the settle rule to the next."""
-POSITION, TORQUE = 8, 10
 
 
 class Stalled(Refused):
@@ -161,8 +161,8 @@ class Mover:
         self.side[:] = 0.0
         self.command.guard = None
         lost = np.abs(self.command.position - self.position) > LOST
-        joints = (self.command.mode != POSITION) | lost
-        self.command.mode[:] = POSITION
+        joints = (self.command.mode != Mode.POSITION) | lost
+        self.command.mode[:] = Mode.POSITION
         self.command.position[joints] = self.position[joints]
 
     def come_to_rest(self) -> None:
@@ -178,7 +178,7 @@ class Mover:
 
     def travel(self, goal: Array, acceleration: float) -> None:
         """Move the joints under position control to goal (n,) [rad], together; raises Stalled, EncoderFault."""
-        movable = self.command.mode == POSITION
+        movable = self.command.mode == Mode.POSITION
         goal = np.where(movable, goal, self.command.position)
         path = trajectory(
             self.command.position.copy(), goal, self.speed, np.full(len(goal), acceleration), self.link.period
@@ -207,7 +207,7 @@ class Mover:
         self.side = np.where(joints, stops, 0).astype(float)
         self.pressed = joints.copy()
         self._guard_stops(BOUNCE)
-        self.command.mode[joints] = TORQUE
+        self.command.mode[joints] = Mode.TORQUE
         cycles = max(int(PRESS_SECONDS / self.link.period), 1)
         start = np.where(joints, self._produced, 0.0)
         shares = np.linspace(1 / cycles, 1.0, cycles)[:, None]

@@ -117,15 +117,6 @@ class _Json:
         return core_schema.no_info_after_validator_function(np.array, schema, serialization=writer)
 
 
-def _swept_side(direction: Array) -> int:
-    """Direction of the one joint that was swept; 0 if none was."""
-    return int(direction.sum())
-
-
-def _all_nan(values: Array) -> bool:
-    return bool(np.isnan(values).all())
-
-
 Vector = Annotated[Array, _Json(list[float])]
 
 
@@ -143,7 +134,7 @@ class StaticReading:
     """Number of the reading within its sweep."""
     joint: int | None
     """Index of the swept joint; None if no joint was swept alone."""
-    direction: Annotated[Array, _Json(Literal[-1, 0, 1], _swept_side)]
+    direction: Annotated[Array, _Json(Literal[-1, 0, 1], lambda direction: int(direction.sum()))]
     """Sign of each joint's last motion (n,); 0 if unknown. A data set keeps the swept joint's alone, as one number."""
     t: float
     """Time on the clock of its samples [s]: of the last one in a sweep, of the middle of the average elsewhere."""
@@ -164,7 +155,9 @@ class StaticReading:
     """Mean of the drives' own torque estimate (n,) [N·m]; NaN if a drive reports none."""
     speed: Annotated[float | None, Field(exclude_if=lambda value: value is None)] = None
     """Mean speed of the swept joint, which crept through the average [rad/s]; None, and not written, at rest."""
-    temperature: Annotated[Vector, Field(exclude_if=_all_nan)] = field(default_factory=lambda: np.array(np.nan))
+    temperature: Annotated[Vector, Field(exclude_if=lambda values: bool(np.isnan(values).all()))] = field(
+        default_factory=lambda: np.array(np.nan)
+    )
     """Of the drives (n,) [°C], NaN where one does not tell it; not written where none does."""
     torque_error: Annotated[Vector, Field(exclude=True)] = field(default_factory=lambda: np.array(np.nan))
     """Standard error of the mean torque (n,) as the halves of the average show it [N·m]; NaN if not judged so."""

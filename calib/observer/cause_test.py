@@ -63,8 +63,7 @@ def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[Change
     stiffness = gravity_stiffness(arm, beta, q)
     for j in range(n):
         yield ChangeHypothesis("slip", j, stiffness[:, :, j].reshape(-1, 1))
-    at_origin, by_point = payload_columns(arm)
-    yield ChangeHypothesis("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
+    yield ChangeHypothesis("payload", None, (regressor @ np.column_stack(payload_columns(arm))).reshape(-1, 4))
     across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
     tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
     yield ChangeHypothesis("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))

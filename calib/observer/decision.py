@@ -125,17 +125,8 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     moved = _moved_zeros(test, verdict, joint)
     if cause != "gain" and moved >= COMMON_JOINTS - 1:
         refused.append(f"the zeros of {moved} other joints moved as well, so the cause may be the temperature")
-    rows = len(test.window.position)
-    return DriftFinding(
-        joint,
-        cause,
-        1.0 + float(change[0]),
-        float(change[1]),
-        wider * covariance,
-        rows,
-        verdict.confidence,
-        tuple(refused),
-    )
+    gain, offset, rows = 1.0 + float(change[0]), float(change[1]), len(test.window.position)
+    return DriftFinding(joint, cause, gain, offset, wider * covariance, rows, verdict.confidence, tuple(refused))
 
 
 def _moved_zeros(test: CauseTest, verdict: Verdict, joint: int) -> int:

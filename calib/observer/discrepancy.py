@@ -65,8 +65,7 @@ class Kernel:
     @cached_property
     def payload_rank(self) -> int:
         """How many of a payload's mass and first moments the arm's levers show, over its whole range."""
-        at_origin, by_point = payload_columns(self._arm)
-        columns = gravity_regressor(self._arm, self.poses) @ np.column_stack([at_origin, by_point])
+        columns = gravity_regressor(self._arm, self.poses) @ np.column_stack(payload_columns(self._arm))
         flat = columns.reshape(-1, columns.shape[2])
         size = np.linalg.norm(flat, axis=0)
         return int(np.linalg.matrix_rank(flat / np.where(size > 1e-9, size, 1.0), tol=1e-6))

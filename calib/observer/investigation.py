@@ -148,11 +148,6 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
         state.start(silent=True)
 
 
-def may_adapt(tracking: Tracking, window: list[StaticReading], config: ObserverConfig) -> bool:
-    """Whether rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open."""
-    return not tracking.belief.learnt or len(window) >= DOUBTED * config.window
-
-
 def is_confirmed(tracking: Tracking, state: Investigation, test: CauseTest, verdict: Verdict) -> bool:
     """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
     if verdict.cause in ("none", "unknown", "ambiguous"):

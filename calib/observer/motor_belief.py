@@ -147,7 +147,9 @@ class MotorBelief:
         """Of records of creep sweeps; rated torques (n,) [N·m]."""
         self.arm, n = arm, arm.n
         doubt = MotorDoubt()  # of what the records do not hold
-        motors = [_motor(joint.motor) for joint in calibration.joints]
+        none = (0.0, 0.0)
+        uncrept = MotorTorque(coulomb=none, load=none, viscous=none, asymmetry=none)  # its friction may be any
+        motors = [joint.motor or uncrept for joint in calibration.joints]
         self._at = family_slices(n)
         self.mean = np.zeros(self._at["rho"].stop)
         std = np.zeros_like(self.mean)
@@ -244,12 +246,6 @@ class MotorBelief:
     def gravity_torque(self, position: Array) -> Array:
         """Gravity torque (K, n) [N·m] at angles (K, n)."""
         return gravity_regressor(self.arm, position) @ self.mean[self._at["beta"]]
-
-
-def _motor(motor: MotorTorque | None) -> MotorTorque:
-    """A joint without a record of friction, which did not creep, may have any."""
-    nothing = (0.0, 0.0)
-    return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
 
 
 def _known_std(calibration: CalibrationRecord, parameter: Parameter, before: Array | float) -> Array:

@@ -17,7 +17,7 @@ from calib.observer.decision import Agreeing, DriftFinding, Event, decide, verdi
 from calib.observer.discrepancy import DiscrepancyLevel
 from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed, may_adapt
+from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed
 from calib.observer.moving_observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.saved_values import UNREADABLE, restored
@@ -157,7 +157,9 @@ class Observer:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state = self._investigation
         test = self._tracking.cause_test(state.window)
-        if state.silent and test.verdict().cause == "unknown" and may_adapt(self._tracking, state.window, self.config):
+        # rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open
+        adapts = not self._tracking.belief.learnt or len(state.window) >= DOUBTED * self.config.window
+        if state.silent and test.verdict().cause == "unknown" and adapts:
             self._tracking.adapt(state.window)
             test = self._tracking.cause_test(state.window)
         verdict = test.verdict()

@@ -140,8 +140,7 @@ class CreepingArm(PlannedArm):
         if self.section.reference_mass is not None:
             return self.section.reference_mass
         random = np.random.default_rng(0)
-        lower, upper = self.ends
-        poses = random.uniform(lower, upper, (400, self.arm.n))
+        poses = random.uniform(*self.ends, (400, self.arm.n))
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)

@@ -60,37 +60,26 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
     import plotly.graph_objects as graph
 
     kinematics, figure = gcomp_arm(arm_file), graph.Figure()
+
+    def draw(points: Array, **style: Any) -> None:
+        x, y, z = points.T
+        figure.add_scatter3d(x=x, y=y, z=z, **style)
+
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)
         poses = begin + np.linspace(0, 1, 4)[:, None] * (end - begin)
         points = np.concatenate(
             [np.vstack([places, np.full((1, 3), np.nan)]) for places in frame_origins(kinematics, poses)]
         )
-        line = {"width": 5, "color": COLOURS[sweep.joint % len(COLOURS)]}
-        figure.add_scatter3d(
-            x=points[:, 0],
-            y=points[:, 1],
-            z=points[:, 2],
-            mode="lines+markers",
-            name=escape(printable_text(sweep.name)),
-            line=line,
-            marker={"size": 3, "color": line["color"]},
-        )
+        name, colour = escape(printable_text(sweep.name)), COLOURS[sweep.joint % len(COLOURS)]
+        line, marker = {"width": 5, "color": colour}, {"size": 3, "color": colour}
+        draw(points, mode="lines+markers", name=name, line=line, marker=marker)
     scouted = frame_origins(kinematics, np.array(plan.scout))[:, -1]
-    figure.add_scatter3d(
-        x=scouted[:, 0],
-        y=scouted[:, 1],
-        z=scouted[:, 2],
-        mode="markers",
-        name=f"{SCOUT_TITLE} (tip)",
-        marker={"size": 4, "color": "black"},
-    )
+    draw(scouted, mode="markers", name=f"{SCOUT_TITLE} (tip)", marker={"size": 4, "color": "black"})
     down = kinematics.gravity / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)
     length = 0.3 * max(float(np.abs(kinematics.span).sum()), 0.1)
     arrow = np.vstack([np.zeros(3), length * down])
-    figure.add_scatter3d(
-        x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
-    )
+    draw(arrow, mode="lines", name="gravity", line={"width": 8, "color": "grey"})
     figure.update_layout(
         title=f"{escape(printable_text(arm_file.name))}: poses of the plan (base frame, m)",
         scene={"aspectmode": "data", "camera": _camera(down)},

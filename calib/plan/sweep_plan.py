@@ -160,13 +160,8 @@ def predicted_gain_std(
         counted.append(np.tile(counts, (sweep.readings, 1)))
     position, counts = np.concatenate(positions), np.concatenate(counted)
     torque = np.where(counts, 0.0, np.nan)
-    rows = len(position)
-    both = StaticReadings.of(
-        np.concatenate([position, position]),
-        np.concatenate([torque, torque]),
-        SCATTER * sigma,
-        np.repeat([0.0, mass], rows),
-    )
+    loads = np.repeat([0.0, mass], len(position))
+    both = StaticReadings.of(np.tile(position, (2, 1)), np.tile(torque, (2, 1)), SCATTER * sigma, loads)
     unknown = {"gain", "offset", "position_gain", "beta", "rho"}
     priors = {}
     if position_offset_std > 0:
@@ -180,12 +175,6 @@ def predicted_gain_std(
         kinematics, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma
     ).std.gain
     return std
-
-
-def worst_gain_std(std: Array) -> float:
-    """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
-    known = std[std < GAIN_STD]  # beyond it more averaging cannot help
-    return float(known.max()) if len(known) else 0.0
 
 
 MASS_SHARES = (0.3, 0.5, 0.7)
@@ -241,7 +230,10 @@ def plan_sweep(
         blocked = _first_blocked(planned, np.array(scout[-1]), sweeps)
         if blocked is None:
             break
-        left = [_without(each, blocked) for each in options]
+        same = np.array(blocked.stops)
+        left = [
+            each.kept((each.stops != same).any(axis=1)) if each.joint == blocked.joint else each for each in options
+        ]
         if not all(each.count for each in left):
             break
         options = left
@@ -312,13 +304,6 @@ def _first_blocked(planned: PlannedArm, here: Array, sweeps: Sequence[Sweep]) ->
     return None
 
 
-def _without(options: Candidates, sweep: Sweep) -> Candidates:
-    """The combinations without that of a sweep."""
-    if options.joint != sweep.joint:
-        return options
-    return options.kept((options.stops != np.array(sweep.stops)).any(axis=1))
-
-
 def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep, ...]:
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in design.candidates]
     picks = design.choose(counts, planned.section.travel_speed * planned.limits.speed)
@@ -338,20 +323,12 @@ def _lightest(
     """
     if planned.guess is None:
         return masses[-1], None
-    section = planned.section
+    section, poses = planned.section, np.array(scout)
+    sigma, zero_std = section.standard_error * planned.limits.rated, section.position_offset_std
     rounding = np.zeros(planned.arm.n) if resolution is None else resolution / np.sqrt(12.0)
     for mass in masses:
-        std = predicted_gain_std(
-            planned.guess,
-            sweeps,
-            np.array(scout),
-            mass,
-            section.standard_error * planned.limits.rated,
-            section.position_offset_std,
-            rounding,
-            section.known_point,
-        )
-        gain_std = worst_gain_std(std)
+        std = predicted_gain_std(planned.guess, sweeps, poses, mass, sigma, zero_std, rounding, section.known_point)
+        gain_std = float(std[std < GAIN_STD].max(initial=0.0))  # beyond it more averaging cannot help
         if gain_std <= section.gain_std:
             break
     return mass, gain_std

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import STANDARD_GRAVITY, ArmFile
 from armlink.errors import Refused
-from armlink.torque_calibration import GAIN_RANGE
+from armlink.torque_calibration import GAIN_RANGE, MOST_OFFSET
 from calib.records.records import PARAMETERS, CalibrationRecord, GravityRecord, JointCalibration, Parameter
 
 R = TypeVar("R", bound=CalibrationRecord | GravityRecord)
@@ -27,9 +27,6 @@ LATEST = datetime.fromtimestamp(2**32 - 1, UTC)
 CLOCK_TOLERANCE = timedelta(hours=26)
 """How far the clocks of two machines that share records may differ: local time of UTC+14 and of UTC-12, both taken for
 UTC, are the furthest apart (IANA time zone database)."""
-LARGEST_TORQUE = 1e4
-"""Offset where the arm file tells no rated torque [N·m]: what a drive is given at most, too
-(`armlink.link.joints.calibrations`)."""
 LARGEST_MASS_MOMENT = 1e5
 """Of any link where the arm file tells no torque [kg·m]: twice 11 t of arm and 2.3 t of load, all at 3.7 m (FANUC
 M-2000iA/2300, data sheet)."""
@@ -104,7 +101,7 @@ def _require_date(record: R, now: datetime | None) -> None:
 
 
 def _of_calibration(record: CalibrationRecord, arm: ArmFile) -> Iterator[BoundedValue]:
-    rated = [LARGEST_TORQUE] * len(record.joints) if arm.link is None else arm.link.rated_torques.tolist()
+    rated = [MOST_OFFSET] * len(record.joints) if arm.link is None else arm.link.rated_torques.tolist()
     bounds: dict[str, float] = {}
     for joint, torque in zip(record.joints, rated, strict=True):
         ranges: dict[Parameter, tuple[float, float, str]] = {

@@ -35,6 +35,12 @@ class ParameterChange:
         change = self.change
         return None if change is None or not self.std else change / self.std
 
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Before, after, change, and the change in standard deviations, for people."""
+        values = ((self.before, ".5f"), (self.after, ".5f"), (self.change, "+.5f"), (self.deviations, "+.1f"))
+        return tuple("–" if value is None else format(value, form) for value, form in values)
+
 
 def differences(
     before: CalibrationRecord | GravityRecord, after: CalibrationRecord | GravityRecord

@@ -36,6 +36,8 @@ from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
+FIGURE_6 = "Model against sensor (as Figure 6 of Ma and Hollerbach)"
+
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
@@ -91,10 +93,7 @@ def _identity(done: Calibrated) -> ReportSection:
 def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
     """Advice on what to do with this calibration, in a few sentences and a command, as HTML."""
     half = fit.half95("gain")
-    known, unknown = (
-        half[np.isfinite(half)],
-        [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
-    )
+    known, unknown = half[np.isfinite(half)], [fit.names[joint] for joint in np.flatnonzero(np.isnan(half))]
     exactly = f"Intervals of gains: ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
     without = f"; the gains of {', '.join(unknown)} are not known, see below" if unknown else ""
     if broken:
@@ -156,14 +155,7 @@ def _comparison(done: Calibrated, fit: SensorFit) -> ReportSection:
 
 def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTable:
     rows = [
-        [
-            each.joint,
-            each.parameter.replace("_", " ") + f" [{each.unit}]",
-            _number(each.before, ".5f"),
-            _number(each.after, ".5f"),
-            _number(each.change, "+.5f"),
-            _number(each.deviations, "+.1f"),
-        ]
+        [each.joint, f"{each.parameter.replace('_', ' ')} [{each.unit}]", *each.texts]
         for each in differences(before, record)
         if each.before is not None or each.after is not None
     ]
@@ -246,15 +238,11 @@ def _left_out(done: Calibrated, fit: SensorFit) -> ReportSection:
         "fitted without these steps, is solid, the sensor is dashed. For poses that are in no sweep, run: "
         f"armlink verify {done.arm.argument} --report verify.html"
     )
-    return ReportSection(
-        "Model against sensor (as Figure 6 of Ma and Hollerbach)",
-        paragraph(text),
-        [left_out_figure(fit.names, sensor, model)],
-    )
+    return ReportSection(FIGURE_6, paragraph(text), [left_out_figure(fit.names, sensor, model)])
 
 
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None or not np.isfinite(value) else format(value, form)
+def _number(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else "–"
 
 
 def _creeps(fit: CreepFit) -> ReportSection:
@@ -278,32 +266,10 @@ def write_verification(
         f"Gravity record {gravity.id} compared with the torque sensors with {sensors}, at "
         f"{len(result.sensor)} random poses that no fit used.{skipped}"
     )
-    header = (
-        "joint",
-        "RMS [N·m]",
-        "allowed RMS",
-        "largest [N·m]",
-        "standard deviation of the model",
-        "largest torque",
-    )
-    numbers = (
-        result.rms,
-        result.tolerance,
-        result.max_error,
-        result.model_std.mean(axis=0),
-        abs(result.model).max(axis=0),
-    )
+    header = ("joint", "RMS [N·m]", "allowed RMS", "largest [N·m]", "standard deviation of the model", "largest torque")
+    of_model = result.model_std.mean(axis=0), abs(result.model).max(axis=0)
+    numbers = (result.rms, result.tolerance, result.max_error, *of_model)
     rows = [[name, *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
-    section = ReportSection(
-        "Model against sensor (as Figure 6 of Ma and Hollerbach)",
-        html,
-        [verify_figure(result)],
-        [ReportTable(header, rows)],
-    )
-    title = f"Verification: {arm.name} {arm.serial}"
-    render(
-        path,
-        title,
-        [section],
-        f"gravity record {gravity.id} of {gravity.created:%Y-%m-%d %H:%M} UTC, {gravity.software}",
-    )
+    section = ReportSection(FIGURE_6, html, [verify_figure(result)], [ReportTable(header, rows)])
+    subtitle = f"gravity record {gravity.id} of {gravity.created:%Y-%m-%d %H:%M} UTC, {gravity.software}"
+    render(path, f"Verification: {arm.name} {arm.serial}", [section], subtitle)

@@ -31,14 +31,8 @@ def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess
     """The rough gravity model from the scout's readings among `readings`."""
     scouted = [reading for reading in readings if reading.sweep == SCOUT]
     limits, section = DriveLimits.of(arm), sweep_section(arm)
-    return guess_gravity(
-        gcomp_arm(arm),
-        stack(scouted, "position"),
-        stack(scouted, "torque"),
-        stack(scouted, "motor_torque"),
-        limits.rated,
-        section.friction,
-    )
+    position, torque, motor = (stack(scouted, channel) for channel in ("position", "torque", "motor_torque"))
+    return guess_gravity(gcomp_arm(arm), position, torque, motor, limits.rated, section.friction)
 
 
 STOP_DISTANCE = 0.02
@@ -156,23 +150,20 @@ class StepPass(SweepPass):
                     standing = True
                 rest = self._step(sweep, *sweep.target(index))
             except Stall as stall:
-                standing, detour = False, True
                 self.bridge(stall, f"{sweep.name} {index + 1}")
-                continue
             except Slipped as slip:
                 retries += 1
-                standing, detour = False, True
                 sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
-                continue
             except Stalled:
                 retries += 1
-                standing, detour = False, True
                 self.acceleration *= SLOWER
                 if retries > RETRIES:
                     raise
+            else:
+                self._save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
+                open_readings.pop(0)
                 continue
-            self._save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
-            open_readings.pop(0)
+            standing, detour = False, True
 
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
         """Bring the resting joints to their places, and press or hold them there; as a `detour`, by way of a pose known

@@ -26,12 +26,7 @@ from armlink.drives.moteus.frames import (
     unpack,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import (
-    BUS_VOLTAGE,
-    MOTOR_TEMPERATURE,
-    STAGE_TEMPERATURE,
-    SimulatedDrive,
-)
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
 DEFAULT_TIMEOUT = 0.1

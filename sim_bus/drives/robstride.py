@@ -34,14 +34,7 @@ from sim_bus.sim_section import serial_of
 ENCODER_FAULT = 1 << FAULTS.index("encoder")
 REPORT_PERIOD = 0.01
 """Period of active reports (type 24) [s]."""
-READ_ONLY = frozenset(
-    (
-        RobStrideParameter.POSITION,
-        RobStrideParameter.CURRENT,
-        RobStrideParameter.VELOCITY,
-        RobStrideParameter.BUS_VOLTAGE,
-    )
-)
+READ_ONLY = frozenset(RobStrideParameter[name] for name in ("POSITION", "CURRENT", "VELOCITY", "BUS_VOLTAGE"))
 
 
 class RobStrideDrive(SimulatedDrive):

@@ -59,12 +59,8 @@ def compare(
             f"{scale * x:.3g}" + ("" if each.free is None else f" ({scale * each.free[j]:.3g})")
             for j, x in enumerate(each.windows)
         )
-        table.add_row(
-            Path(each.model).name if alone else each.model,
-            f"{value:.3g}",
-            f"{low:.3g} to {high:.3g}",
-            *cells,
-        )
+        model = Path(each.model).name if alone else each.model
+        table.add_row(model, f"{value:.3g}", f"{low:.3g} to {high:.3g}", *cells)
     out.print(table)
     for model, finding in found.checks:
         out.print(f"{model}: {finding.sentence()}", style="yellow")

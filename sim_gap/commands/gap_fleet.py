@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Json, reads_recordings
+from armlink.commands.output import write_json
 from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
 
 if TYPE_CHECKING:
@@ -45,7 +46,6 @@ def diagnose_fleet(
     """
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.extras import require_extra
     from sim_gap.better_model.training_files import write_parquet
@@ -147,7 +147,6 @@ def trend(
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled

@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 
 from armlink.commands.options import Arm, Json, OtherBus
+from armlink.commands.output import write_json
+from armlink.errors import BadInput
 
 
 def plan(
@@ -30,7 +32,6 @@ def plan(
     Example: armlink gap plan sarcos --answer gap.json --out settle.csv
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from sim_gap.experiment import joints_in_doubt, plan_motion, save_motion
 
@@ -65,9 +66,7 @@ def collect(
 
     from armlink.arm_file import load_arm
     from armlink.commands.early_end import early_end
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainColumn, PlainConsole, command_line, results, suggest
-    from armlink.errors import BadInput
     from armlink.extras import require_extra
     from armlink.loop.open import open_arm
     from sim_gap.experiment import collect as run

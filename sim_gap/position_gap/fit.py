@@ -176,16 +176,9 @@ class Layout:
             return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
 
         weight = data.weight.transpose(1, 0, 2).reshape(shape) * min(data.judged_s / INDEPENDENT_S, 1.0)
-        block = np.broadcast_to(np.arange(data.count), (len(data.measured), data.count)).ravel()
-        coarse = replace(data, plant=data.plant.coarser)
-        return EstimationProblem(
-            parameters,
-            partial(predicted, data),
-            weight,
-            block.astype(np.intp),
-            self.search.floor,
-            cheaper=partial(predicted, coarse),
-        )
+        block = np.broadcast_to(np.arange(data.count), (len(data.measured), data.count)).ravel().astype(np.intp)
+        fine, coarse = (partial(predicted, each) for each in (data, replace(data, plant=data.plant.coarser)))
+        return EstimationProblem(parameters, fine, weight, block, self.search.floor, cheaper=coarse)
 
     def _parameter(self, j: int, name: str, step: float | None) -> FittedParameter:
         if j < 0:

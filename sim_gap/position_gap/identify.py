@@ -115,13 +115,7 @@ def identify(
     data = thin(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED, moving=True)
     judged = thin(windows_of(plant, heldout, labels[len(train) :], scale[len(train) :]), JUDGED)
     never = frozenset(withhold) | _frozen(sim, data)
-    search = LoopSearch(
-        data,
-        scales_of(data),
-        nominal_point(plant),
-        noise_floor(data),
-        never,
-    )
+    search = LoopSearch(data, scales_of(data), nominal_point(plant), noise_floor(data), never)
     moved_train = moved = np.full(sim.n, np.nan)
     if complete:
         moved_train, moved = (

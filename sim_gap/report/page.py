@@ -87,18 +87,9 @@ def _cause_row(cause: Cause) -> list[str]:
 
 
 def _gap(answer: Diagnosis) -> Section:
-    rows = [
-        [name, *(f"{x:.3g}" for x in numbers)]
-        for name, *numbers in zip(
-            answer.names,
-            answer.noise_floor,
-            answer.train_before,
-            answer.train_after,
-            answer.heldout_before,
-            answer.heldout_after,
-            strict=True,
-        )
-    ]
+    train, heldout = (answer.train_before, answer.train_after), (answer.heldout_before, answer.heldout_after)
+    joints = zip(answer.names, answer.noise_floor, *train, *heldout, strict=True)
+    rows = [[name, *(f"{x:.3g}" for x in numbers)] for name, *numbers in joints]
     header = ("joint", "noise floor", "training data: before", "after", "held-out data: before", "after")
     text = (
         f"RMS gap of the simulation per joint, in {answer.unit}, before and after the causes were added to "

@@ -101,14 +101,8 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         )
 
     def routes(self) -> Mapping[int, int]:
-        services = (
-            TPDO1.cob_base,
-            TPDO2.cob_base,
-            TPDO3.cob_base,
-            objects.EMCY_ID,
-            objects.HEARTBEAT_ID,
-            objects.SDO_RESPONSE_ID,
-        )
+        pdos = [pdo.cob_base for pdo in (TPDO1, TPDO2, TPDO3)]
+        services = (*pdos, objects.EMCY_ID, objects.HEARTBEAT_ID, objects.SDO_RESPONSE_ID)
         return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
 
     def commands(self) -> Mapping[int, str]:

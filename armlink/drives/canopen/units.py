@@ -49,12 +49,8 @@ def units_from(rated_torque_mnm: int, encoder: tuple[int, int], gear: tuple[int,
             f"one of 6076h ({rated_torque_mnm}), 608Fh ({encoder}), 6091h ({gear}) and 6092h ({feed}) contains a zero"
         )
     increments_a_turn = encoder[0] / encoder[1] * gear[0] / gear[1]
-    return Units(
-        torque=rated_torque_mnm * 1e-6,
-        position=2 * math.pi * feed[1] / feed[0],
-        velocity=2 * math.pi * feed[1] / feed[0],
-        encoder_step=2 * math.pi / increments_a_turn,
-    )
+    unit, step = 2 * math.pi * feed[1] / feed[0], 2 * math.pi / increments_a_turn
+    return Units(torque=rated_torque_mnm * 1e-6, position=unit, velocity=unit, encoder_step=step)
 
 
 def told_units(services: NodeServices, rated_torque_mnm: int) -> Units:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.output import write_json
+from armlink.errors import BadInput
 from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
@@ -90,14 +92,12 @@ def new(
     Example: armlink new arm.urdf --out arm.yaml
     """
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
-    from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
-    from armlink.errors import BadInput
+    from armlink.drives.family import family
     from armlink.loop.open import first_check
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
-    from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm
 
     console = PlainConsole()
@@ -132,7 +132,9 @@ def new(
         raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
     out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
     found = bundled or model
-    have_ids = is_arm_file and drives_have_ids(load_arm(found))
+    have_ids = is_arm_file and all(
+        family(joint.settings.family).search is None for joint in load_arm(found).require_link().joints
+    )
     if not found.is_file():  # before anything is asked
         raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
@@ -185,7 +187,6 @@ def _hand(bus: str, by_hand: bool | None, interactive: bool) -> "Ask | None":
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:
     from armlink.commands.plain_console import confirm
-    from armlink.errors import BadInput
 
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise BadInput(f"--out {out}: expected a file that ends in .yaml")

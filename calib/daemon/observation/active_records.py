@@ -92,7 +92,11 @@ class ActiveRecords:
         """Take over what the store has now; while it fails, the records in force stay in force."""
         self._looking = False
         if isinstance(found, StoreFault):
-            self._store_failed(found)
+            self._looked = self._environment.monotonic() - RECORDS_SECONDS + RETRY_SECONDS
+            if not self._store_fault:
+                kept = "" if self.observation is None else "; the current records stay in use"
+                self._events.say("fault", None, f"{found}{kept}", {})
+            self._store_fault = str(found)
             return
         if self._store_fault:
             self._store_fault = ""
@@ -105,13 +109,6 @@ class ActiveRecords:
             self._take_over(*found)
         except ArmlinkError as error:
             self.detail = str(error)
-
-    def _store_failed(self, fault: StoreFault) -> None:
-        self._looked = self._environment.monotonic() - RECORDS_SECONDS + RETRY_SECONDS
-        if not self._store_fault:
-            kept = "" if self.observation is None else "; the current records stay in use"
-            self._events.say("fault", None, f"{fault}{kept}", {})
-        self._store_fault = str(fault)
 
     def _take_over(self, calibration: CalibrationRecord | None, gravity: GravityRecord | None) -> None:
         """Observe against these records, if they are other ones; raises Refused if they are of another arm."""

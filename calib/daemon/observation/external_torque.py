@@ -73,14 +73,10 @@ class ExternalTorque:
         if self.live is None:
             return
         channel = self.live.learned.listener.channel
-        torque = batch.channels[channel]
-        for event in self.live.take(
-            batch.t,
-            batch.channels["position"],
-            batch.channels["velocity"],
-            feed.reading(torque) if channel == "torque" else torque,
-            batch.temperature,
-        ):
+        position, velocity, torque = (batch.channels[name] for name in ("position", "velocity", channel))
+        if channel == "torque":
+            torque = feed.reading(torque)
+        for event in self.live.take(batch.t, position, velocity, torque, batch.temperature):
             self._tell(event)
 
     def interrupt(self) -> None:

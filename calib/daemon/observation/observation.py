@@ -182,17 +182,14 @@ class ActiveObservation:
         if self._jobs.busy:
             return  # the calibration changes under these readings
         events = self.feed.observe(samples, batch.temperature)
-        self._note_accepted()
-        if events:
-            self._report(events)
-        self.recalibrations.watch(samples, self.feed.observer.held)
-
-    def _note_accepted(self) -> None:
         accepted = self.feed.observer.accepted
         for name, more in zip(self.feed.names, accepted > self._accepted, strict=True):
             if more:
                 self.last_accepted[name] = self._events.now()
         self._accepted = accepted
+        if events:
+            self._report(events)
+        self.recalibrations.watch(samples, self.feed.observer.held)
 
     def _report(self, events: list[Event]) -> None:
         """Keep events and estimates together, then act on the findings."""

@@ -75,14 +75,8 @@ class EventLog:
         text = " ".join(text.split())
         level = logging.WARNING if kind in ("fault", "refused", "alarm") else logging.INFO
         log.log(level, text, extra={"kind": kind, "joint": joint})
-        return {
-            "time": self.now(),
-            "t": self._monotonic(),
-            "kind": kind,
-            "joint": joint,
-            "text": text,
-            "evidence": finite(evidence),
-        }
+        at = {"time": self.now(), "t": self._monotonic()}
+        return {**at, "kind": kind, "joint": joint, "text": text, "evidence": finite(evidence)}
 
     def tick(self) -> None:
         """Report that the wall clock, which dates the events, was set."""
@@ -133,18 +127,17 @@ def describe(event: Event) -> Description:
     """An observer's event in the terms of the API (docs/daemon-api.md)."""
     joint, evidence = event.joint or "the arm", event.evidence
     if event.kind == "alarm":
-        return "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})", evidence
-    if event.kind == "outliers":
-        return "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model", evidence
-    if event.kind == "undecided":
-        return (
-            "undecided",
-            f"{joint}: the calibration was not changed: {'; '.join(evidence.get('reasons', []))}",
-            evidence,
-        )
-    if event.kind == "proposal":
-        return "drift", f"{joint}: a drift of the sensor is confirmed: {_change(evidence)}", evidence
-    return _verdict(joint, evidence)
+        kind, text = "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})"
+    elif event.kind == "outliers":
+        kind, text = "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model"
+    elif event.kind == "undecided":
+        why = "; ".join(evidence.get("reasons", []))
+        kind, text = "undecided", f"{joint}: the calibration was not changed: {why}"
+    elif event.kind == "proposal":
+        kind, text = "drift", f"{joint}: a drift of the sensor is confirmed: {_change(evidence)}"
+    else:
+        kind, text = _verdict(joint, evidence)
+    return kind, text, evidence
 
 
 def one_alarm_a_joint(events: list[Event]) -> list[Event]:
@@ -162,32 +155,25 @@ def one_alarm_a_joint(events: list[Event]) -> list[Event]:
     return merged
 
 
-def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
+def _verdict(joint: str, evidence: dict[str, Any]) -> tuple[str, str]:
     cause, sure = evidence["cause"], f"confidence {evidence['confidence']:.1%}"
     if evidence.get("motor") and cause in _OF_MOTORS:
         kind, text = _OF_MOTORS[cause]
         change, std = evidence["values"][0], evidence["std"][0]
-        return kind, f"{joint}: {text.format(change=change, std=2 * std)}; {sure}", evidence
+        return kind, f"{joint}: {text.format(change=change, std=2 * std)}; {sure}"
     if cause in DRIFT:
         beside = f", and {evidence['beside']}" if "beside" in evidence else ""
-        return (
-            "drift",
-            f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; nothing was written yet",
-            evidence,
-        )
+        return "drift", f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; nothing was written yet"
     if cause == "none":
-        return "clear", "sensors and model agree again, so the cause is gone (a collision, a contact, a load)", evidence
+        return "clear", "sensors and model agree again, so the cause is gone (a collision, a contact, a load)"
     if cause in ("payload", "tool"):
-        return "payload", f"{_load(cause, evidence)}; {sure}", evidence
+        return "payload", f"{_load(cause, evidence)}; {sure}"
     if cause == "ambiguous":
-        return "undecided", f"the cause is still ambiguous ({' or '.join(evidence['rivals'])}); {sure}", evidence
+        return "undecided", f"the cause is still ambiguous ({' or '.join(evidence['rivals'])}); {sure}"
     if cause == "unknown":
-        return (
-            "contact",
-            "contact, or several effects at once: no single cause explains the readings; estimates are paused",
-            evidence,
-        )
-    return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are paused", evidence
+        several = "contact, or several effects at once: no single cause explains the readings; estimates are paused"
+        return "contact", several
+    return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are paused"
 
 
 def _load(cause: str, evidence: dict[str, Any]) -> str:

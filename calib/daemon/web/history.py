@@ -170,7 +170,10 @@ class Histories:
 
     async def aside(self, owner: str, work: Callable[[], T]) -> T:
         """The value of `work`, which reads history, from the thread; raises TooMany and what `work` raises."""
-        self._enter(owner)
+        self._under_way = +self._under_way
+        if self._under_way.total() >= MOST_ANSWERS or self._under_way[owner] >= MOST_OF_AN_OWNER:
+            raise TooMany(f"{self._under_way.total()} long answers are already under way: ask again in a moment")
+        self._under_way[owner] += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
         finally:
@@ -202,12 +205,6 @@ class Histories:
                 piece = await asyncio.get_running_loop().run_in_executor(self._thread, next, pieces, None)
         finally:
             self._under_way[owner] -= 1
-
-    def _enter(self, owner: str) -> None:
-        self._under_way = +self._under_way
-        if self._under_way.total() >= MOST_ANSWERS or self._under_way[owner] >= MOST_OF_AN_OWNER:
-            raise TooMany(f"{self._under_way.total()} long answers are already under way: ask again in a moment")
-        self._under_way[owner] += 1
 
 
 def _as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:

@@ -33,7 +33,7 @@ from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.environment import CLOSING_SECONDS
 from calib.daemon.view import DaemonView, StreamItem
-from calib.daemon.web.connection import PATIENCE_SECONDS, App, protocol_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, protocol_of
 from calib.daemon.web.guard import Access, RequestGuard, names_of_host
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.routes import ERRORS, api_router
@@ -120,26 +120,14 @@ def _complete(schema: dict[str, Any]) -> None:
     components["securitySchemes"] = {"token": TOKEN}
     schema["security"] = [{}, {"token": []}]
     events = schema["paths"]["/api/stream"]["get"]["responses"]["200"]["content"]["text/event-stream"]
-    events["schema"] = {"type": "string", "contentMediaType": "application/json", "x-data": _reference("StreamItem")}
-
-
-def _reference(name: str) -> dict[str, str]:
-    return {"$ref": f"#/components/schemas/{name}"}
+    item = {"$ref": "#/components/schemas/StreamItem"}
+    events["schema"] = {"type": "string", "contentMediaType": "application/json", "x-data": item}
 
 
 PURPOSE = (
     "This API shows the observed state of an arm, and lets a person approve or reject proposed recalibrations. "
     "It can command neither torque nor motion."
 )
-
-
-def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Streams]:
-    """The guarded ASGI application on a view, and its streams, to be closed at the end."""
-    streams = Streams(view)
-    files = page_files()
-    app = open_app(view, streams, files)
-    access = replace(access or Access(), open_paths=frozenset(files))
-    return RequestGuard(app, access), streams
 
 
 def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
@@ -154,7 +142,11 @@ def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> 
     app.include_router(api_router(view, streams, metrics_text(view, streams)))
     for path, file in files.items():
         app.add_api_route(path, _sender(file), methods=["GET"], include_in_schema=False)
-    _add_error_handlers(app)
+    for kind, status in ERRORS.items():
+        app.add_exception_handler(kind, _as_json(status))
+    app.add_exception_handler(RequestValidationError, _bad_parameter)
+    app.add_exception_handler(HTTPException, _of_http)
+    app.add_exception_handler(Exception, _unexpected)
     return app
 
 
@@ -166,14 +158,6 @@ def _sender(file: PageFile) -> Callable[[Request], Awaitable[Response]]:
         return Response(file.content, media_type=file.media_type, headers=headers)
 
     return send
-
-
-def _add_error_handlers(app: FastAPI) -> None:
-    for kind, status in ERRORS.items():
-        app.add_exception_handler(kind, _as_json(status))
-    app.add_exception_handler(RequestValidationError, _bad_parameter)
-    app.add_exception_handler(HTTPException, _of_http)
-    app.add_exception_handler(Exception, _unexpected)
 
 
 def _as_json(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
@@ -301,10 +285,11 @@ class _ApiServer(uvicorn.Server):
 
 
 async def _run(view: DaemonView, listening: list[sockets.socket], access: Access) -> None:
-    app, streams = make_app(view, access)
+    streams, files = Streams(view), page_files()
+    guarded = RequestGuard(open_app(view, streams, files), replace(access, open_paths=frozenset(files)))
     _allow_files()
     config = uvicorn.Config(
-        app,
+        guarded,
         http=protocol_of(),
         timeout_keep_alive=round(PATIENCE_SECONDS),
         ws="none",
