@@ -11,7 +11,6 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.plan.collisions import POINTS
 from calib.plan.plan_limits import ROUNDING, refuse_unfit, require_bounds
 from calib.plan.planned_arm import COLLIDING, PlannedArm
 from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, guess_of_file, is_vertical, known_lever
@@ -291,9 +290,8 @@ def _candidates(
     for _ in range(CANDIDATES * DRAWS):
         lower = random.uniform(low, high - span) if high - low > span else low
         one = CreepCandidate(joint, random.uniform(lowest, highest), lower, lower + span)
-        begin = one.poses(2)[0]
-        clear = creeping.free(one.poses(POINTS + 1)).all() and creeping.is_clear(home, begin)
-        if clear and creeping.bearable(one, mass):
+        begin, end = one.poses(2)
+        if creeping.is_clear(begin, end) and creeping.is_clear(home, begin) and creeping.bearable(one, mass):
             found.append(one)
             if len(found) == CANDIDATES:
                 break

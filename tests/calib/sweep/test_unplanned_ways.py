@@ -19,7 +19,7 @@ from armlink.errors import HostLate
 from armlink.link.link import Link
 from calib.dataset import load_data
 from calib.motion.mover import Mover, Slipped, Stalled
-from calib.plan.collisions import Collided, Contact, straight_way
+from calib.plan.collisions import Collided, Contact
 from calib.plan.planned_arm import PlannedArm
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import APPROACH
@@ -104,6 +104,9 @@ class Walls:
     def contacts(self, pose: Array) -> list[Contact]:
         return [] if self.free(pose[None])[0] else [Contact(("post", "fore"), 0.01)]
 
+    def way(self, begin: Array, end: Array, *, standing: bool = False) -> Iterator[tuple[Array, list[Contact]]]:
+        return ((pose, self.contacts(pose)) for pose in np.linspace(begin, end, 100)[int(standing) :])
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -128,7 +131,7 @@ def between(
     there, refuge, goal = np.array([0.3, 0.9]), np.array(plan.scout[0]), next_pose(cut)
     ways = [*[(there, goal)] * (not straight), *[(there, refuge)] * (not by_refuge)]
     walls = Walls(*ways)
-    assert walls.free(straight_way(refuge, goal)).all()
+    assert walls.free(np.linspace(refuge, goal, 100)).all()
     monkeypatch.setattr(step_pass, "PlannedArm", lambda arm: SimpleNamespace(geometry=walls))
     return Bench(Path(shutil.copytree(cut, tmp_path / "bare")), there, walls)
 
@@ -195,7 +198,7 @@ def test_a_pass_that_is_resumed_among_its_first_poses_leaves_out_what_it_does_no
     with standing(arm, first) as watched, pytest.raises(PowerCut):
         run_sweep(watched.link, arm, folder, progress=ends)
     walls = Walls((here, second))
-    assert walls.free(straight_way(here, third)).all()
+    assert walls.free(np.linspace(here, third, 100)).all()
     monkeypatch.setattr(step_pass, "PlannedArm", lambda arm: SimpleNamespace(geometry=walls))
     with standing(arm, here) as watched:
         resumed(arm, watched, folder)
