@@ -217,25 +217,12 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan, here: Array | None = None) ->
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return f"collisions are not checked: {geometry.left_out or 'the model has no geometry'}"
-    count = _require_free(arm_file, geometry, ways_along(plan, here))
+    count = require_free(arm_file, geometry, ways_along(plan, here))
     without = f", without {geometry.left_out}" if geometry.left_out else ""
     return f"no collision at {count} poses along the way{without}"
 
 
-def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: Array) -> None:
-    """Check every creep of a plan, and the way to it from the home pose, which is reached from `here` (n,) [rad].
-
-    Raises Collided naming bodies, sweep and pose.
-    """
-    home = np.array(plan.scout[0])
-    _require_free(arm_file, geometry, [(TO_THE_PLAN, here, home)])
-    for sweep in plan.sweeps:
-        begin, end = sweep_ends(sweep)
-        ways = [(f"on the way to sweep {sweep.name}", home, begin), (f"in sweep {sweep.name}", begin, end)]
-        _require_free(arm_file, geometry, ways)
-
-
-def _require_free(arm_file: ArmFile, geometry: Geometry, ways: Iterable[tuple[str, Array, Array]]) -> int:
+def require_free(arm_file: ArmFile, geometry: Geometry, ways: Iterable[tuple[str, Array, Array]]) -> int:
     """How many poses were looked at on ways, each with its description, from a pose (n,) [rad] at which the arm stands
     to another; raises Collided at the first contact."""
     count = 0
@@ -261,7 +248,7 @@ def clear_way(
     for way in ways:
         try:
             if geometry is not None:
-                _require_free(arm_file, geometry, [(place, *leg) for leg in pairwise(way)])
+                require_free(arm_file, geometry, [(place, *leg) for leg in pairwise(way)])
             return way
         except Collided as collided:
             found.append(collided)
