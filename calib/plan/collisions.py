@@ -115,21 +115,22 @@ class Geometry:
         no two shapes together that are apart (conservative advancement), at least by what moves them 2 DEPTH. An arm
         `standing` at the first pose may leave bodies that it touches there.
         """
-        left = [contact.bodies for contact in self.contacts(begin)] if standing else []
-        self._bring(begin)
-        travel, share = self._levers @ np.abs(end - begin), 0.0
+        begun = self.contacts(begin)
+        left = [each.bodies for each in begun] if standing else []
+        travel, pose, share = self._levers @ np.abs(end - begin), begin, 0.0
         may_meet = travel > np.maximum(self._sphere_gaps(self._pairs, self._radii), 0.0)
         pairs, travel, radii = self._pairs[:, may_meet], travel[may_meet], self._radii[may_meet]
         gap = np.full(len(travel), -np.inf)
         while True:
-            pose = begin + share * (end - begin)
-            touching = [each for each in self.contacts(pose) if share > PARTING or each.bodies not in left]
-            np.maximum(gap, self._sphere_gaps(pairs, radii), out=gap)
+            gap = np.maximum(gap, self._sphere_gaps(pairs, radii))
             step = self._clear_share(pairs, travel, gap, 1.0 - share)
-            yield pose, touching
+            touching = self.contacts(pose) if begun or gap.min(initial=np.inf) <= 0 else []
+            yield pose, [each for each in touching if share > PARTING or each.bodies not in left]
             if share == 1.0:
                 return
             share, gap = min(share + step, 1.0), gap - step * travel
+            pose = begin + share * (end - begin)
+            self._bring(pose)
 
     def _clear_share(self, pairs: npt.NDArray[np.intp], travel: Array, gap: Array, rest: float) -> float:
         """Share of a way, up to its `rest`, on which none of some pairs of shapes (2, P) comes together that is apart

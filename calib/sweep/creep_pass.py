@@ -75,9 +75,9 @@ class CreepPass(SweepPass):
         goal = np.array(sweep.rest)
         goal[joint] = low
         mover.hold_all()
-        here, place = mover.command.position.copy(), f"on the way from its present pose to sweep {sweep.name}"
+        here, title = mover.command.position.copy(), f"on the way from its present pose to sweep {sweep.name}"
         ways = [[here, goal], [here, self._home, goal]]
-        for pose in clear_way(self.arm, self._creeping.geometry, ways, place)[1:]:
+        for pose in clear_way(self.arm, self._creeping.geometry, ways, title)[1:]:
             mover.travel(pose, self._plan.travel_acceleration)
         self._pause()
         found: list[StaticReading] = []
