@@ -11,7 +11,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.plan.collisions import POINTS
+from calib.plan.collisions import TO_THE_PLAN, Geometry, require_free
 from calib.plan.plan_limits import ROUNDING, refuse_unfit, require_bounds
 from calib.plan.planned_arm import COLLIDING, PlannedArm
 from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, guess_of_file, is_vertical, known_lever
@@ -198,6 +198,20 @@ def check_creep_limits(creeping: CreepingArm, arm_file: ArmFile, plan: SweepPlan
     refuse_unfit(arm_file, _unfit(creeping, plan))
 
 
+def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: Array) -> None:
+    """Check every creep of a plan, and the way to it from the home pose, which is reached from `here` (n,) [rad].
+
+    Raises Collided naming bodies, sweep and pose.
+    """
+    home = np.array(plan.scout[0])
+    ways = [(TO_THE_PLAN, here, home)]
+    for sweep in plan.sweeps:
+        begin, end = (np.array(sweep.rest) for _ in range(2))
+        begin[sweep.joint], end[sweep.joint] = creep_ends(sweep)
+        ways += [(f"on the way to sweep {sweep.name}", home, begin), (f"in sweep {sweep.name}", begin, end)]
+    require_free(arm_file, geometry, ways)
+
+
 def _unfit(creeping: CreepingArm, plan: SweepPlan) -> Iterator[str]:
     mass, (lowest, highest) = creeping.mass(), creeping.ends
     most = min(creeping.section.acceleration, TRAVEL_ACCELERATION)
@@ -290,9 +304,8 @@ def _candidates(
     for _ in range(CANDIDATES * DRAWS):
         lower = random.uniform(low, high - span) if high - low > span else low
         one = CreepCandidate(joint, random.uniform(lowest, highest), lower, lower + span)
-        begin = one.poses(2)[0]
-        clear = creeping.free(one.poses(POINTS + 1)).all() and creeping.is_clear(home, begin)
-        if clear and creeping.bearable(one, mass):
+        begin, end = one.poses(2)
+        if creeping.is_clear(begin, end) and creeping.is_clear(home, begin) and creeping.bearable(one, mass):
             found.append(one)
             if len(found) == CANDIDATES:
                 break

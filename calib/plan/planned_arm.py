@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.plan.collisions import Geometry, straight_way
+from calib.plan.collisions import Geometry
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates
 from gcomp.arrays import Array, Mask
@@ -88,7 +88,7 @@ class PlannedArm:
 
     def is_clear(self, begin: Array, end: Array) -> bool:
         """Whether nothing touches on the straight way between two poses (n,) [rad]."""
-        return bool(self.free(straight_way(begin, end)).all())
+        return self.geometry is None or not any(touching for _, touching in self.geometry.way(begin, end))
 
     def reachable_poses(
         self, count: int, random: np.random.Generator, begin: Array, reach: float = np.inf, about: float = 0.0
@@ -102,8 +102,7 @@ class PlannedArm:
             if len(found) == count:
                 break
             pose: Array = random.uniform(*np.clip([here - reach, here + reach], lower + about, upper - about))
-            around = np.unique(straight_way(pose - about, pose + about), axis=0)
-            if self.free(around).all() and self.is_clear(here, pose):
+            if self.is_clear(pose - about, pose + about) and self.is_clear(here, pose):
                 found.append(pose)
                 here = pose
         if count and not found:

@@ -12,7 +12,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.plan.collisions import Collided, straight_way, sweep_ends
+from calib.plan.collisions import Collided, sweep_ends
 from calib.plan.planned_arm import SLOWEST, PlannedArm, nearest_first
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments, stop_combinations, with_lever
@@ -114,13 +114,12 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
 
 
 def _without_collision(candidates: Candidates, planned: PlannedArm) -> Candidates:
-    """The combinations along which nothing touches, at the poses `check_plan` looks at; raises Collided if none."""
-    ways = straight_way(candidates.poses[:, 0], candidates.poses[:, -1])
-    flat = ways.reshape(-1, planned.arm.n)
-    free = np.all(planned.free(flat).reshape(candidates.count, -1), axis=1)
+    """The combinations along which nothing touches; raises Collided if there is none."""
+    ends = candidates.poses[:, [0, -1]]
+    free = np.array([planned.is_clear(*each) for each in ends])
     if free.any() or planned.geometry is None:
         return candidates.kept(free)
-    first, second = next(found for pose in flat for found in planned.geometry.contacts(pose)).bodies
+    first, second = next(found for _, touching in planned.geometry.way(*ends[0]) for found in touching).bodies
     raise Collided(
         f"joint {planned.arm.names[candidates.joint]}: in every combination of stops two bodies touch, for example "
         f"{first} and {second}: narrow lower and upper in the arm file"

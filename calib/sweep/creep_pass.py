@@ -1,5 +1,7 @@
 """Creeps: a joint moves at constant speed both ways; all readings of a sweep are on disk before the next begins."""
 
+from contextlib import suppress
+
 import numpy as np
 
 from armlink.errors import Refused, Stall
@@ -7,11 +9,12 @@ from armlink.link.guard import ReadingBounds
 from calib.dataset import StallLine
 from calib.motion.mover import Stalled
 from calib.motion.static_reading import StaticReading, bin_readings
-from calib.plan.collisions import check_creeps
+from calib.plan.collisions import Collided, clear_way
 from calib.plan.creep_plan import (
     RAMP,
     CreepingArm,
     check_creep_limits,
+    check_creeps,
     creep_ends,
     creep_seconds,
     creep_speed,
@@ -64,15 +67,18 @@ class CreepPass(SweepPass):
         self.tell(len(self._made), sweep.name, up)
 
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
+        """Readings of a creep there and back; raises Collided, before anything moves, where the ways to it, straight
+        and by the home pose, lead through contacts."""
         mover, joint = self.mover, sweep.joint
         middles, speed = np.array(sweep.steps), creep_speed(sweep)
         low, high = creep_ends(sweep)
         goal = np.array(sweep.rest)
         goal[joint] = low
         mover.hold_all()
-        if not self._creeping.is_clear(mover.command.position, goal):
-            mover.travel(self._home, self._plan.travel_acceleration)
-        mover.travel(goal, self._plan.travel_acceleration)
+        here, title = mover.command.position.copy(), f"on the way from its present pose to sweep {sweep.name}"
+        ways = [[here, goal], [here, self._home, goal]]
+        for pose in clear_way(self.arm, self._creeping.geometry, ways, title)[1:]:
+            mover.travel(pose, self._plan.travel_acceleration)
         self._pause()
         found: list[StaticReading] = []
         temperature = self._temperature()
@@ -116,7 +122,7 @@ class CreepPass(SweepPass):
         return found if np.isfinite(found).all() else None
 
     def _note_contact(self, sweep: Sweep, stalled: Stalled) -> None:
-        """Lead the joint back, and note the sweep as not made."""
+        """Note the sweep as not made, and lead the joint back, unless something stands in the way."""
         mover = self.mover
         self._contacts += 1
         mover.come_to_rest()
@@ -131,6 +137,8 @@ class CreepPass(SweepPass):
             raise Refused(
                 f"{text}; {self._contacts} sweeps ended with a contact: clear the workspace, or narrow lower and upper"
             )
-        goal = mover.command.position.copy()
+        here, goal = mover.command.position.copy(), mover.command.position.copy()
         goal[sweep.joint] = sweep.rest[sweep.joint]
-        mover.travel(goal, self._plan.travel_acceleration)
+        with suppress(Collided):  # then it stays until there is a way to the next sweep
+            clear_way(self.arm, self._creeping.geometry, [[here, goal]], sweep.name)
+            mover.travel(goal, self._plan.travel_acceleration)

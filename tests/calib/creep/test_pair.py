@@ -9,8 +9,8 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
 from armlink.link.link import Link
 from calib.arm.sweep_section import CreepSection, ParkedArm, SweepSection
-from calib.plan.collisions import Collided, Geometry, check_creeps
-from calib.plan.creep_plan import plan_creep
+from calib.plan.collisions import Collided, Geometry
+from calib.plan.creep_plan import check_creeps, plan_creep
 from calib.sweep.run import run_sweep
 from sim_bus.arms import __file__ as bundled
 from sim_bus.bus.lock_step import LockStepBus

@@ -13,20 +13,21 @@ import numpy as np
 import pytest
 from bench_arm import along, bench, post
 from sweep_arms import at_rate, with_section
+from walls import Walls, Watched
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import HostLate
 from armlink.link.link import Link
 from calib.dataset import load_data
 from calib.motion.mover import Mover, Slipped, Stalled
-from calib.plan.collisions import Collided, Contact, straight_way
+from calib.plan.collisions import Collided
 from calib.plan.planned_arm import PlannedArm
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import APPROACH
 from calib.sweep import step_pass
 from calib.sweep.run import run_sweep
 from calib.sweep.step_pass import STOP_DISTANCE
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -39,24 +40,6 @@ SWEPT = "on the way from its present pose to sweep elbow.1"
 
 class PowerCut(Exception):
     """It stops the first attempt."""
-
-
-class Watched:
-    """An enabled link, and what it was commanded."""
-
-    def __init__(self, link: Link) -> None:
-        self.link, self.kept = link, list[Array]()
-        cycle, play = link.cycle, link.play
-
-        def cycled(command: Any) -> Any:
-            self.kept.append(command.position.copy())
-            return cycle(command)
-
-        def played(setpoints: Any) -> Any:
-            self.kept.extend(setpoints.position)
-            return play(setpoints)
-
-        link.cycle, link.play = cycled, played  # type: ignore[method-assign]
 
 
 @contextmanager
@@ -92,19 +75,6 @@ def cut(arm: ArmFile, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Walls:
-    """Geometry of which the test says where it touches: around the middles of ways, in the space of the joints."""
-
-    def __init__(self, *ways: tuple[Array, Array]) -> None:
-        self.middles = [(begin + end) / 2 for begin, end in ways]
-
-    def free(self, poses: Array) -> Mask:
-        return np.all([np.linalg.norm(poses - each, axis=1) > 0.15 for each in self.middles], axis=0)
-
-    def contacts(self, pose: Array) -> list[Contact]:
-        return [] if self.free(pose[None])[0] else [Contact(("post", "fore"), 0.01)]
-
-
 @dataclass(frozen=True)
 class Bench:
     """A pass that was cut off, and a pose whose ways to the next reading, straight and by the plan's first pose, are
@@ -128,7 +98,7 @@ def between(
     there, refuge, goal = np.array([0.3, 0.9]), np.array(plan.scout[0]), next_pose(cut)
     ways = [*[(there, goal)] * (not straight), *[(there, refuge)] * (not by_refuge)]
     walls = Walls(*ways)
-    assert walls.free(straight_way(refuge, goal)).all()
+    assert walls.free(np.linspace(refuge, goal, 100)).all()
     monkeypatch.setattr(step_pass, "PlannedArm", lambda arm: SimpleNamespace(geometry=walls))
     return Bench(Path(shutil.copytree(cut, tmp_path / "bare")), there, walls)
 
@@ -195,7 +165,7 @@ def test_a_pass_that_is_resumed_among_its_first_poses_leaves_out_what_it_does_no
     with standing(arm, first) as watched, pytest.raises(PowerCut):
         run_sweep(watched.link, arm, folder, progress=ends)
     walls = Walls((here, second))
-    assert walls.free(straight_way(here, third)).all()
+    assert walls.free(np.linspace(here, third, 100)).all()
     monkeypatch.setattr(step_pass, "PlannedArm", lambda arm: SimpleNamespace(geometry=walls))
     with standing(arm, here) as watched:
         resumed(arm, watched, folder)
