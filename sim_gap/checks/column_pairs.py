@@ -127,9 +127,9 @@ def _delay(recording: Recording, velocity: Array, pairs: ColumnPairs) -> float:
         return 0.0
     longest = max(2, min(len(rate) // 4, round(0.3 / period)))
     size = np.sqrt(np.mean(rate**2, axis=0))
-    off = lambda k: (((velocity[k:] - rate[: len(rate) - k]) / size) ** 2).sum(1)  # noqa: E731
-    rows = int(np.argmin([off(k).mean() for k in range(longest)]))
-    better = off(0)[rows:] - off(rows)
+    squares = [(((velocity[k:] - rate[: len(rate) - k]) / size) ** 2).sum(1) for k in range(longest)]
+    rows = int(np.argmin([each.mean() for each in squares]))
+    better = squares[0][rows:] - squares[rows]
     chance = np.sqrt(2.0 * (PRICE + np.log(longest))) * better.std() / np.sqrt(len(better))
     return rows * period if better.mean() > chance and rows > LATE_ROWS and rows * period > LATE_S else 0.0
 

@@ -56,7 +56,7 @@ class HypothesisTest:
 def _exceeds_chance(falls: Array) -> bool:
     """Whether the sum of falls in held-out parts (…, F) is more than parts that differ by chance make."""
     by_part = falls.sum(0)
-    return float(by_part.sum()) > SIGNIFICANT * float(by_part.std(ddof=1)) * np.sqrt(len(by_part))
+    return bool(by_part.sum() > SIGNIFICANT * by_part.std(ddof=1) * np.sqrt(len(by_part)))
 
 
 def _is_likelier(one: HypothesisTest, other: HypothesisTest) -> bool:
