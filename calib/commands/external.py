@@ -161,7 +161,6 @@ def external(
 
 def parse_rate(text: str) -> float:
     """Events an hour of `1/h` or `2/d`; raises BadInput."""
-
     number, _, unit = text.partition("/")
     hours = {"h": 1.0, "d": 24.0, "min": 1.0 / 60.0}
     try:

@@ -15,6 +15,7 @@ from typing import Any
 from armlink.arm_file import SIMULATED, STANDARD_GRAVITY, ArmFile, Bus, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.content.yaml_text import EditedYaml, yaml_comment, yaml_entry, yaml_item
+from armlink.drives.family import family
 from armlink.drives.findings import FoundDrive, FoundDrives, SetupFinding
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
@@ -305,6 +306,11 @@ def match_drives(
     gears = [1.0 if each.family == "canopen" else each.gear for each in settings]
     turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, gears, strict=True)]
     return match_by_hand(turned, drives, bus, ask)
+
+
+def drives_have_ids(arm: ArmFile) -> bool:
+    """Whether the drives of an arm are found by the ids of its arm file alone."""
+    return all(family(joint.settings.family).search is None for joint in arm.require_link().joints)
 
 
 def drive_id(joint: LinkJoint) -> int:

@@ -97,13 +97,13 @@ def _signs(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iter
 def _zeros(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
     positions, every = ("q", *follows), tuple(range(arm.n))
     largest = np.abs(motion.q).max(axis=0)
-    if np.median(largest) > math.pi:  # as angles in degrees are, and those of one joint are not
-        text, change = _option("units", positions, "deg"), partial(_positions, factor=math.radians(1.0))
-        yield Hypothesis("scale", ("q",), every, "the positions are in degrees", text, change)
-    for j in np.flatnonzero(largest > math.pi).tolist():
-        factor = np.where(np.isin(every, j), math.radians(1.0), 1.0)
-        text, change = _option("units", positions, "deg", j), partial(_positions, factor=factor)
-        yield Hypothesis("scale", ("q",), (j,), "the position is in degrees", text, change, POSITION_CHOICES)
+    far = [j for j in every if largest[j] > math.pi]
+    for joints in [*[every] * bool(np.median(largest) > math.pi), *((j,) for j in far if arm.n > 1)]:
+        one, what = (None, "positions are") if joints is every else (joints[0], "position is")
+        change = partial(_positions, factor=np.where(np.isin(every, joints), math.radians(1.0), 1.0))
+        choices = 1 if joints is every else POSITION_CHOICES  # a single joint in another unit is rarer
+        text = _option("units", positions, "deg", one)
+        yield Hypothesis("scale", ("q",), joints, f"the {what} in degrees", text, change, choices)
     for j, angle in product(every, (0.5 * math.pi, -0.5 * math.pi, math.pi)):
         text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
         what, change = f"the zero is off by {angle:+.2f} rad", partial(_positions, zero=angle * np.eye(arm.n)[j])

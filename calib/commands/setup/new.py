@@ -93,11 +93,11 @@ def new(
     """
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
-    from armlink.drives.family import family
     from armlink.loop.open import first_check
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
+    from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm
 
     console = PlainConsole()
@@ -132,9 +132,7 @@ def new(
         raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
     out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
     found = bundled or model
-    have_ids = is_arm_file and all(
-        family(joint.settings.family).search is None for joint in load_arm(found).require_link().joints
-    )
+    have_ids = is_arm_file and drives_have_ids(load_arm(found))
     if not found.is_file():  # before anything is asked
         raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
