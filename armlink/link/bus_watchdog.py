@@ -9,7 +9,8 @@ CROWD_PER_JOINT, CROWD = 5, 30
 OWN_RATE = 250.0
 """Drives that send by their own clock do so 5 times per joint at this rate at most [Hz], whatever the cycle."""
 CROWDED_CYCLES = 10
-"""Consecutive cycles above that limit that mean a babbling node."""
+"""Cycles at twice that limit or more that mean a babbling node, or more of less. A backlog, of a host or a device that
+had no processor for a while, is less."""
 DOUBLE_CYCLES = 3
 """Consecutive cycles with two readings of one joint that mean a second node with its id."""
 FORGIVEN = 250
@@ -36,7 +37,8 @@ class BusWatch:
         """Torques that came alone, less positions, of late; none less than 0."""
         self._positions_before = [0] * joints
         """Positions when the newest torque alone came."""
-        self._crowded_cycles = 0
+        self._beyond = 0.0
+        """Frames beyond the limit, in cycles' worth of it; it falls as cycles bring less than that."""
         self.others: dict[int, int] = {}
         """Frames of this cycle that were no readings of the fast way, by identifier."""
         self.strangers = 0
@@ -61,7 +63,7 @@ class BusWatch:
         self._positions_before = [0] * len(self.readings)
         self.forged: int | None = None
         """The joint in whose name a second node sends torques, velocities or states; None: no joint."""
-        self._crowded_cycles = 0
+        self._beyond = 0.0
         self._counted = [0] * len(self.readings)
         self._culprit: str | int = ""
         self.crowding = 0.0
@@ -74,7 +76,7 @@ class BusWatch:
 
     def settle(self) -> None:
         """After an interruption: reset the crowding counters; replies that are owed may still arrive."""
-        self.flooded, self._crowded_cycles, self.crowding, self.reception = False, 0, 0.0, ""
+        self.flooded, self._beyond, self.crowding, self.reception = False, 0.0, 0.0, ""
         self._doubled.clear()
         self._double_cycles = [0] * len(self._double_cycles)
 
@@ -111,8 +113,9 @@ class BusWatch:
                     self._double_cycles[joint], self.readings[joint] = 0, min(self.readings[joint], self.syncs)
             self._doubled.clear()
         self.crowding += (self.strangers - self.crowding) / CROWDED_CYCLES
-        self._crowded_cycles = self._crowded_cycles + 1 if frames > self._crowd * max(periods, 1.0) else 0
-        if self._crowded_cycles or self.flooded or self.strangers:
+        limit = self._crowd * max(periods, 1.0)
+        self._beyond = max(self._beyond + min(frames / limit - 1.0, 1.0), 0.0)
+        if self._beyond or self.flooded or self.strangers:
             most = self._most_frequent()
             self._culprit = self._culprit if most == "" else most
         self.others.clear()
@@ -135,7 +138,7 @@ class BusWatch:
     @property
     def babbling(self) -> bool:
         """Whether more frames arrive than a bus with these joints should carry."""
-        return self.flooded or self._crowded_cycles >= CROWDED_CYCLES
+        return self.flooded or self._beyond >= CROWDED_CYCLES
 
     @property
     def culprit(self) -> str | int:

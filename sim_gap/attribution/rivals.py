@@ -68,12 +68,14 @@ class Rivals:
         self.choice = choice
 
     def weigh(self, effect: str, terms: Sequence[Term]) -> tuple[float, tuple[str, ...]]:
-        """Score lost without a cause at its best-founded place, if best replaced, and its equally good rivals."""
+        """Score lost without a cause at the place where it is missed most, if best replaced, and its equally good
+        rivals there."""
         choice = self.choice
         present = [term for term in choice.current if term in terms and term.effect == effect]
-        outcomes = [self._replaced(term) for term in sorted(present, key=lambda term: (term.place, term.shape))]
-        lost, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
-        return max(lost, 0.0), tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
+        missed = {term: choice.judge(choice.without(term, choice.current)) for term in present}
+        most = max(present, key=lambda term: (missed[term], term.place, term.shape), default=None)
+        evidence, rivals = self._replaced(most) if most else (0.0, [])
+        return max(evidence, 0.0), tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
 
     def _may_be_constants(self, terms: Sequence[Term]) -> bool:
         """Whether other constants of all motors, at the price of one effect, explain as much as all masses named."""

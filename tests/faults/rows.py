@@ -113,7 +113,7 @@ ROWS = (
         "babbling node",
         "a node babbles",
         "node.babbling:joint_2:20000",
-        "more frames per cycle than these joints send, in ten consecutive cycles",
+        "twice as many frames per cycle as these joints may send, in ten cycles",
         11,
         QUICK_STOP,
         "the bus carries more frames than these joints send, most of them 001h: a node babbles, disconnect this node",

@@ -211,6 +211,23 @@ def test_a_late_host_gets_the_frames_of_the_time_that_it_took() -> None:
         assert bus.babbling
 
 
+@given(
+    cycles=st.lists(st.integers(0, 500), min_size=30, max_size=200),
+    extra=st.integers(CROWD_PER_JOINT + CROWD, 20 * CROWD),
+)
+def test_a_backlog_is_no_flood_however_many_cycles_bring_it(cycles: list[int], extra: int) -> None:
+    """What waited while host or device had no processor comes at once or little by little; a flood stays."""
+    bus, left, limit = BusWatch(1), (CROWDED_CYCLES - 1) * (CROWD_PER_JOINT + CROWD), CROWD_PER_JOINT + CROWD
+    for wanted in cycles:
+        more = min(wanted, left)
+        left -= more
+        bus.cycle_ends(limit + more, 1.0)
+        assert not bus.babbling
+    for _ in range(CROWDED_CYCLES):
+        bus.cycle_ends(limit + extra, 1.0)
+    assert bus.babbling
+
+
 def test_answers_to_other_requests_do_not_make_readings_that_catch_up_a_second_node():
     bus = BusWatch(1)
 
