@@ -134,7 +134,8 @@ be minor."""
 def relevant_terms(
     step: CauseStep, estimate: EffectEstimate, heldout: ResidualSet, scorer: _Scorer, within: bool
 ) -> tuple[Term, ...]:
-    """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount.
+    """Those of a step's terms that matter: a sound arm has less of them, and without the others together no joint's RMS
+    rises by a relevant amount.
 
     A step as a whole matters if it lowers some RMS so far, in its place or as the last of all: an effect whose part
     others take as well as they can, such as load-dependent friction, shows in what they leave.
@@ -157,13 +158,14 @@ def relevant_terms(
         last, first = (scorer.falls(terms, lost, by_row) for terms in kept)
         return np.maximum(last, np.minimum(first, scorer.taken(lost)))
 
-    places, small = {term.place for term in step.terms}, set[int]()
+    unusual = [term for term in step.terms if not estimate.is_usual(term)]
+    places, small = {term.place for term in unusual}, set[int]()
     if np.all(rise(places) < least):
         return ()
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):
             small.add(place)
-    return tuple(term for term in step.terms if term.place not in small) or step.terms
+    return tuple(term for term in unusual if term.place not in small) or tuple(unusual)
 
 
 def causes(

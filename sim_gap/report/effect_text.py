@@ -23,7 +23,7 @@ def advice(answer: Diagnosis) -> str:
 def sentence(answer: Diagnosis) -> str:
     """The verdict in a sentence, without a full stop."""
     if answer.verdict == "no_gap":
-        return "No significant gap: all residuals are close to the noise floor"
+        return "No significant gap: all residuals are close to the noise floor, or what a sound arm has"
     if answer.verdict == "unexplained" and answer.unexplained < 0.01 and answer.notes:
         return f"Gap not explained: {answer.notes[0]}"
     if answer.verdict == "unexplained":

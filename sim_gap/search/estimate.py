@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
@@ -114,9 +114,7 @@ class EffectEstimate:
         systematic = SYSTEMATIC**2 * float(self.linear.counts.sum()) / max(len(self._jacobian), 1) * inverse
         background = np.zeros(size)
         for term in self.terms:
-            usual = term.form.plausibility
-            std = self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
-            background[self.equations.at[term]] = std
+            background[self.equations.at[term]] = self._background(term)
         whole = _sandwich(inverse, scores) + systematic + self._undetected(inverse) + np.diag(background**2)
         wider = self._widening(whole, inverse, scores)
         return np.asarray(whole * wider * wider[:, None])
@@ -178,6 +176,15 @@ class EffectEstimate:
         if shares_a_factor(self.equations.layout, self.terms):
             errors.append(NOMINAL * arm.inertial[:, 1:4].reshape(-1, 1))
         return np.hstack(errors)
+
+    def _background(self, term: Term) -> float:
+        """Standard deviation of a term's coefficients over sound arms."""
+        usual = term.form.plausibility
+        return self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
+
+    def is_usual(self, term: Term) -> bool:
+        """Whether a sound arm may have as much of an effect: every coefficient is within 95 % of theirs."""
+        return bool(np.all(np.abs(self.of(term)) <= ndtri(0.975) * self._background(term)))
 
     def may_be_nothing(self, term: Term) -> bool:
         """Whether the 95 % interval of every coefficient of a term contains zero."""
