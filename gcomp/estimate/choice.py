@@ -3,10 +3,9 @@
 All is linear about one point, so that a choice takes no further evaluation of the problem.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -327,76 +326,5 @@ def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> Lin
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class HeldOutEvidence:
-    """How much better one set of effects predicts held-out rows than another."""
-
-    fall: float
-    """Fall of the negative logarithm of the likelihood."""
-    error: float
-    """Its standard error over the folds."""
-
-
-def evidence(terms: LinearTerms, less: Iterable[int], more: Iterable[int]) -> HeldOutEvidence:
-    each = (terms.costs(less) - terms.costs(more)).sum(0)
-    fall = float((terms.cost(less) - terms.cost(more)).sum())
-    return HeldOutEvidence(fall, float(each.std(ddof=1) * np.sqrt(len(each))) if len(each) > 1 else 0.0)
-
-
 def price_of(effect: Effect[Name]) -> float:
     return PRICE * len(effect.parameters) if effect.price is None else effect.price
-
-
-def choose(
-    terms: LinearTerms,
-    effects: Sequence[Effect[Name]],
-    chosen: Iterable[Name],
-    kept: Iterable[Name] = (),
-    most: int = 1000,
-    progress: Callable[[Name], None] = lambda name: None,
-) -> list[Name]:
-    """Effects in the order in which they pay most beside those there, from the ones `chosen` on; then those that do
-    not pay any more are taken out, but for those `kept`: one by one, and two of the same channels that only undo each
-    other."""
-    by_name = {effect.name: effect for effect in effects}
-    current = [name for name in chosen if name in by_name]
-
-    def free(names: Iterable[Name]) -> frozenset[int]:
-        return frozenset(k for name in names for k in by_name[name].parameters)
-
-    def pays(less: Sequence[Name], more: Sequence[Name], *between: Name) -> float:
-        """Gain beyond the prices of what is between; not positive for one that is not sure over the folds."""
-        shown = evidence(terms, free(less), free(more))
-        sure = shown.fall > SIGNIFICANT * shown.error or shown.error == 0.0
-        return shown.fall - sum(price_of(by_name[name]) for name in between) if sure else -np.inf
-
-    for _ in range(most):
-        best: Name | None = None
-        gain = 0.0
-        for effect in effects:
-            if effect.name in current or not set(effect.needs) <= set(current):
-                continue
-            worth = pays(current, [*current, effect.name], effect.name)
-            if worth > gain:
-                best, gain = effect.name, worth
-        if best is None:
-            break
-        progress(best)
-        current.append(best)
-    fixed = set(kept)
-    acts_on = {
-        effect.name: frozenset(c for c, index in enumerate(terms.acting) if np.isin(effect.parameters, index).any())
-        for effect in effects
-    }
-    while True:
-        needed = {need for name in current for need in by_name[name].needs}
-        loose = [name for name in current if name not in fixed and name not in needed]
-        pairs = [pair for pair in combinations(loose, 2) if acts_on[pair[0]] == acts_on[pair[1]]]
-        for groups in ([(name,) for name in loose], pairs):
-            losses = ((pays([n for n in current if n not in out], current, *out), out) for out in groups)
-            least, worst = min(losses, key=lambda each: each[0], default=(1.0, ()))
-            if least <= 0.0:
-                break
-        else:
-            return current
-        current = [name for name in current if name not in worst]

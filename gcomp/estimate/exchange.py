@@ -25,10 +25,17 @@ class EffectChoice(Generic[Name]):
     """The effects `current` of those offered, and steps to better ones."""
 
     def __init__(
-        self, terms: LinearTerms, effects: Mapping[Name, Effect[Name]], current: Iterable[Name] = (), least: float = 0.0
+        self,
+        terms: LinearTerms,
+        effects: Mapping[Name, Effect[Name]],
+        current: Iterable[Name] = (),
+        least: float = 0.0,
+        kept: Iterable[Name] = (),
     ) -> None:
-        """`least` is the fall of the score that an effect has to bring which is added or exchanged."""
+        """`least` is the fall of the score that an effect has to bring which is added or exchanged; effects `kept` are
+        never taken out."""
         self.plain, self.effects, self.least = terms, effects, max(least, AS_GOOD)
+        self.kept = frozenset(kept)
         self.worse = set[frozenset[Name]]()
         self._take([name for name in current if name in effects])
 
@@ -106,14 +113,15 @@ class EffectChoice(Generic[Name]):
 
     def backward(self) -> bool:
         """Take the effect out that is missed least, if the rest scores as well without it."""
-        return self.step((self.without(name, self.current) for name in self.current), self.score + AS_GOOD, AS_GOOD)
+        trials = (self.without(name, self.current) for name in self.current)
+        return self.step((each for each in trials if self.kept <= {*each}), self.score + AS_GOOD, AS_GOOD)
 
     def exchange(self) -> bool:
         """Put one effect in the place of another, or simpler ones together in that of one, if that scores better."""
         return self.step(self._exchanged(), self.score - self.least)
 
     def _exchanged(self) -> Iterator[list[Name]]:
-        for name in list(self.current):
+        for name in [each for each in self.current if self.kept <= {*self.without(each, self.current)}]:
             rest = self.without(name, self.current)
             offered = self._rest([*rest, name])
             for other in self.shortlist(rest, offered, EXCHANGED) if offered else ():

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
+from gcomp.estimate.choice import PRICE, Effect, LinearTerms, price_of, terms_of
+from gcomp.estimate.exchange import EffectChoice
 from gcomp.estimate.problem import linearise
 from gcomp.estimate.solve import cost_of, prior_cost, scale_of
 from sim_gap.position_gap.fit import Group, Layout, LoopFit, LoopSearch, Place, residuals, rms_on
@@ -176,7 +177,9 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     for number in range(ROUNDS):
         progress(f"round {number + 1}: testing {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked, levels)
-        found = choose(about.terms, list(about.effects.values()), names, kept)
+        found = EffectChoice(
+            about.terms, about.effects, [name for name in names if name in about.effects], kept=kept
+        ).run()
         if number == 0:
             looked = {*promising(about, names), *found, *names}
         made = search.improve(entered(search, about.moved(found)), FITTING)
