@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation, label, maximum_filter1d
 from scipy.signal import find_peaks, peak_widths
 
 from armlink.recording.recording import Recording
+from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_quality import TIMES_USUAL, Disturbance, spectrum
 from sim_gap.residuals.layout import Row
@@ -139,41 +140,56 @@ def slow_gaps(
 
 
 def fast_gaps(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
-    """Lines and resonances above the pass band: the largest of each channel and joint, with frequency and RMS [N·m]."""
-    names, best = data.signals[0].arm.names, dict[Row, Location]()
+    """Lines and resonances above the pass band: the largest of each channel and joint, with frequency and RMS [N·m].
+
+    One is a gap if it is more than the inertia of the arm asks for there, the positions with their noise being what the
+    arm did: a servo that rings moves the arm.
+    """
+    arm, best = data.signals[0].arm, dict[Row, Location]()
     for recording in recordings:
+        inertia = _mass_matrix(arm, np.nanmean(recording.position, axis=0))
         for channel, name in CHANNELS.items():
             values = getattr(recording, name)
-            for joint in range(len(names)) if values is not None else ():
-                found = _peak(recording.t, values[:, joint])
+            for joint in range(arm.n) if values is not None else ():
+                found = _peak(recording.t, values[:, joint], recording.position @ inertia[joint])
                 row = (channel, joint)
                 if found and (row not in best or found[1] > best[row].rms):
-                    hz, rms, share = found
-                    noise = data.floor.get(row, 0.0)
+                    hz, rms, share, asked = found
+                    noise = float(np.hypot(data.floor.get(row, 0.0), asked))
                     clear = rms > max(data.relevant_nm, 2.0 * noise)
-                    best[row] = Location(names[joint], channel, "band", rms, noise, share, hz, clear)
+                    best[row] = Location(arm.names[joint], channel, "band", rms, noise, share, hz, clear)
     return [each for each in best.values() if each.clear]
 
 
-def _peak(t: Array, values: Array) -> tuple[float, float, float] | None:
-    """Frequency [Hz], RMS and share of the power above the band of the strongest line or resonance there, if any."""
-    there = np.isfinite(values)
+def _mass_matrix(arm: RigidArm, q: Array) -> Array:
+    """Inertia of links and rotors at positions (n,), (n, n) [kg·m²]."""
+    rows, none = np.eye(arm.n), np.zeros((arm.n, arm.n))
+    return arm.torque(np.tile(q, (arm.n, 1)), none, rows, np.zeros(3)) + np.diag(arm.armature)
+
+
+def _peak(t: Array, values: Array, moved: Array) -> tuple[float, float, float, float] | None:
+    """Frequency [Hz], RMS and share of the power above the band of the strongest line or resonance there, if any, and
+    the RMS that a motion with the momentum's integral `moved` [kg·m²] asks for in it."""
+    there = np.isfinite(values) & np.isfinite(moved)
     if there.sum() < 1024:
         return None
-    own, x = t[there], values[there]
+    own = t[there]
     step = float(np.median(np.diff(own)))
-    frequency, density = spectrum(np.interp(np.arange(own[0], own[-1], step), own, x), 1.0 / step)
+    even = np.arange(own[0], own[-1], step)
+    (frequency, density), (_, motion) = (spectrum(np.interp(even, own, x[there]), 1.0 / step) for x in (values, moved))
     smooth = np.log(np.convolve(density, np.ones(SMOOTHED_BINS) / SMOOTHED_BINS, mode="same") + 1e-300)
     peaks, shapes = find_peaks(smooth, prominence=np.log(PEAK_HEIGHT))
     left, right = peak_widths(smooth, peaks, rel_height=0.9)[2:]
-    best: tuple[float, float] | None = None
+    best: tuple[float, float, float] | None = None
     for k in np.flatnonzero(frequency[peaks] > LOWEST_PEAK_HZ).tolist():
         inside = slice(int(np.floor(left[k])), int(np.ceil(right[k])) + 1)
         foot = float(np.exp(smooth[peaks[k]] - shapes["prominences"][k]))
         power = float(np.sum(np.maximum(density[inside] - foot, 0.0)) * frequency[1])
         if best is None or power > best[1]:
-            best = float(frequency[inside][np.argmax(density[inside])]), power
+            asked = float(np.sum(motion[inside] * (2.0 * np.pi * frequency[inside]) ** 4) * frequency[1])
+            best = float(frequency[inside][np.argmax(density[inside])]), power, asked
     if best is None:
         return None
     total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
-    return best[0], float(np.sqrt(best[1])), min(best[1] / max(total, 1e-300), 1.0)
+    hz, power, asked = best
+    return hz, float(np.sqrt(power)), min(power / max(total, 1e-300), 1.0), float(np.sqrt(asked))

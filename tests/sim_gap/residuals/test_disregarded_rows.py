@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -58,3 +59,25 @@ def test_noise_without_a_peak_is_none(recording, order):
     noise = np.random.default_rng(5).normal(size=len(recording.t))
     forms = {"white": ([1.0], [1.0]), "rising": ([1.0, -0.95], [1.0]), "falling": ([1.0], [1.0, -0.8])}
     assert places(recording, 0.5 * lfilter(*forms[order], noise)) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_what_the_arm_moves_by_is_no_gap(recording, noise):
+    """A servo rings: joint 2 swings at 12 Hz, and the torques are what MuJoCo's mass matrix asks for."""
+    arm, swing = model(), 2.0 * np.pi * 12.0
+    data, inertia = mujoco.MjData(arm), np.zeros((len(recording.t), arm.nv))
+    for row, q in zip(inertia, recording.position, strict=True):
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(arm, data)
+        whole = np.zeros((arm.nv, arm.nv))
+        mujoco.mj_fullM(arm, data, whole)
+        row[:] = whole[1]
+    size = 0.6 * np.sqrt(2.0) / (inertia[:, 1].mean() * swing**2)
+    line = size * np.sin(swing * recording.t)
+    position = recording.position + noise * np.random.default_rng(7).normal(size=recording.position.shape)
+    position[:, 1] += line
+    torque = recording.torque - swing**2 * line[:, None] * inertia
+    made = replace(recording, position=position, torque=torque)
+    data_set = ResidualSet((signals := prepare(made, load_model(model()).arm),), layout_of([signals]))
+    assert fast_gaps(data_set, [made]) == []
+    assert fast_gaps(data_set, [replace(made, position=recording.position)])
