@@ -8,10 +8,6 @@ import numpy as np
 
 CONFIDENT = 0.8
 """Confidence above which a cause counts as blamed."""
-DOUBLED = 2.0
-"""Least factor on the sound arm's gap by an effect that has to be named among several."""
-MAIN_SHARE = 0.15
-"""Least parameter of a joint that counts to a cause, as a share of the cause's largest."""
 BESIDE_POINT = ("phase", "rest", "source", "other_joint")
 """Parameters that are indices or depend on another one."""
 
@@ -100,7 +96,7 @@ def _shown(label: Json, truths: Sequence[Json]) -> list[Json]:
     if label["kind"] != "several":
         return []
     falls = zip(label["effects"], label["gap"]["falls"], strict=True)
-    clear = [t["effect"] for t, fall in falls if fall["before"] > DOUBLED * fall["after"]]
+    clear = [t["effect"] for t, fall in falls if fall["before"] > 2.0 * fall["after"]]
     return [t for t in truths if t["effect"] in clear]
 
 
@@ -147,7 +143,7 @@ def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, i
 
 
 def _main_joints(cause: Json) -> list[str]:
-    """Joints of a cause whose largest parameter (a gain's distance from 1) is not small against the others'."""
+    """Joints of a cause whose largest parameter (a gain's distance from 1) is 15 % of that of any joint or more."""
     sizes = {}
     for joint in cause["joints"]:
         values = cause["parameters"].get(joint) or {}
@@ -155,7 +151,7 @@ def _main_joints(cause: Json) -> list[str]:
             _deviation(n, p["value"]) for n, p in values.items() if n not in BESIDE_POINT and p["value"] is not None
         ]
         sizes[joint] = max((abs(x) for x in numbers), default=np.inf)
-    limit = MAIN_SHARE * max(sizes.values(), default=0.0)
+    limit = 0.15 * max(sizes.values(), default=0.0)
     return [joint for joint, size in sizes.items() if size >= limit or np.isinf(size)]
 
 

@@ -16,8 +16,7 @@ ATTEMPTS = 600
 OTHER_PAIR = 20
 """Number of arms drawn for two effects before two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
-UNKNOWN_SHARE = 0.3
-"""Share of the cases of positions alone whose model has no controller."""
+"""Shares of the cases without an effect, and with two."""
 INDISTINCT = (
     {"actuator.lag", "actuator.delay"},
     {"link.payload", "link.mass_moment"},
@@ -99,9 +98,9 @@ def _pair(random: np.random.Generator) -> tuple[str, ...]:
 
 
 def servo_recipes(seed: int, count: int) -> list[CaseRecipe]:
-    """`count` cases of positions alone, every effect in turn."""
+    """`count` cases of positions alone, every effect in turn; the model of three in ten has no controller."""
     random = np.random.default_rng([seed, 7])
-    known = random.random(count) > UNKNOWN_SHARE
+    known = random.random(count) > 0.3
     none = random.permutation(count) < round(NONE_SHARE * count)
     every = [*controller.DRAWS, *controller.OF_THE_ARM]
     orders = {True: random.permutation(every).tolist(), False: random.permutation(controller.UNKNOWN).tolist()}

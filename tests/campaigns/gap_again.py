@@ -24,7 +24,7 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.attribution.residual_laws import as_effects
 from sim_gap.better_model.export import HELD, write_model
-from sim_gap.blind.bench import make_apart
+from sim_gap.blind.bench import make_cases
 from sim_gap.blind.real_recordings import KNOWN, read_cases, recordings_of
 
 MOST = 0.05
@@ -98,7 +98,7 @@ def real_cases(folder: Path, only: str) -> Iterator[Case]:
 
 
 def bench_cases(folder: Path, seed: int, cases: int, effects: str) -> Iterator[Case]:
-    for _ in make_apart(folder, seed=seed, cases=cases, workers=1, lengths=LENGTHS, effects=effects):
+    for _ in make_cases(folder, seed, cases, 1, LENGTHS, effects):
         pass
     for path in sorted((folder / "cases").iterdir()):
         train, heldout = ([load_recording(path / f"{each}.csv")] for each in ("train", "heldout"))

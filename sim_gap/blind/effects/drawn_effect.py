@@ -11,9 +11,6 @@ from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.scene import Scene, ServoLaw
 
-OFTEN_HZ = 0.08
-"""Rate of torque reversals from which effects at a reversal show [Hz]."""
-
 Values = dict[str, float]
 
 
@@ -108,7 +105,7 @@ def sign(random: np.random.Generator) -> float:
 
 
 def reverses_often(scene: Scene, width: Array) -> Mask:
-    """Joints whose torque often passes from beyond +width to beyond −width or back, (n,)."""
+    """Joints whose torque passes from beyond +width to beyond −width or back every 12.5 s or more often, (n,)."""
     beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(scene.torque.T, width, strict=True))
     counts = np.array([np.count_nonzero(np.diff(signs)) for signs in beyond])
-    return np.asarray(counts >= OFTEN_HZ * scene.seconds)
+    return np.asarray(counts >= 0.08 * scene.seconds)

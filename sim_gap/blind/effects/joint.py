@@ -22,10 +22,6 @@ from sim_gap.blind.scene import LEAST_SPEED, THINNED_S, Scene, rms
 
 PERIOD_S = 1.0 / RECORDED_HZ
 """Sample interval of the recordings [s]: shorter delays do not show, and those of drives take two to four."""
-LEAST_ELASTIC_NM = 0.25
-"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
-LEAST_ROTOR_SHARE = 0.12
-"""Least rotor inertia behind a spring, as a share of its joint's: the simulated arm has none below a tenth."""
 SLOW = "needs steps, a chirp or faster logging"
 
 
@@ -62,9 +58,9 @@ def motor_limit(scene: Scene, random: np.random.Generator) -> Array:
 
 
 def gear_stiffness(scene: Scene, random: np.random.Generator) -> Array:
-    """From the RMS deflection [rad]; of a joint that shows it, with a resonance above 4 Hz."""
+    """From the RMS deflection [rad]; of a joint that shows it by 0.25 N·m, with a resonance above 4 Hz."""
     stiffness = rms(scene.torque) / random.uniform(0.015, 0.04)
-    shown = scene.turn_felt(scene.torque / stiffness).max(0) > LEAST_ELASTIC_NM
+    shown = scene.turn_felt(scene.torque / stiffness).max(0) > 0.25
     return np.where(shown & (stiffness >= (2 * np.pi * 4.0) ** 2 * scene.inertia), stiffness, np.inf)
 
 
@@ -74,8 +70,9 @@ def gear_play(scene: Scene, random: np.random.Generator) -> Array:
 
 
 def heavy_rotor(scene: Scene, j: int) -> dict[str, Any]:
-    """The nominal arm with a rotor that a spring can carry, as a field of DrawnEffect."""
-    least = float(LEAST_ROTOR_SHARE / (1.0 - LEAST_ROTOR_SHARE) * scene.link_inertia[j])
+    """The nominal arm with a rotor of 12 % of the joint's inertia or more: behind a spring the simulated arm has none
+    below a tenth."""
+    least = float(0.12 / (1.0 - 0.12) * scene.link_inertia[j])
     return {"nominal": lambda arm: arm.with_entry("armature", j, max(float(arm.armature[j]), least))}
 
 

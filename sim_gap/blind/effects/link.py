@@ -11,8 +11,6 @@ from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect
 from sim_gap.blind.scene import Scene, rms
 
 XYZ = ("x", "y", "z")
-LEAST_WEIGHT_SHARE = 0.1
-"""Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
 UPRIGHT = "the axis is vertical: a moved mass shows only in its inertia"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
@@ -38,7 +36,7 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
         moved = arm.with_moved(link, moment)
-        weighs = rms(scene.change_at_rest(moved))[link] > LEAST_WEIGHT_SHARE * _felt(scene, moved, link)
+        weighs = rms(scene.change_at_rest(moved))[link] > 0.1 * _felt(scene, moved, link)
         why, others = ("", ()) if weighs else (UPRIGHT, ("link.inertia",))
         values = {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}
         moves = partial(BenchArm.with_moved, link=link, moment=moment)

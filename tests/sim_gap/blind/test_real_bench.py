@@ -54,7 +54,7 @@ def test_shares_over_all_answers():
     answers = {
         "arm": answer(cause("friction.coulomb"), cause("link.payload", mass=3.0)),
         "arm--without--link.payload": answer(cause("torque.gain"), verdict="ambiguous"),
-        "servo": answer(verdict="refused"),
+        "servo": {**answer(verdict="unexplained"), "refused": "no torque channel"},
     }
     score = score_real(answers, [CASE, refused])
     assert (score["right_first"], score["named"], score["refused_as_known"]) == (1.0, 1.0, 1.0)
