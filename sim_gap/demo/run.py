@@ -1,17 +1,9 @@
 """Runs the demo: each step is a call of the product; the demo's own are the hidden truth, the operator, the order."""
 
-import os
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from functools import partial
-from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from threading import Thread
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +46,6 @@ from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 
-Made = TypeVar("Made")
 BY = "armlink demo"
 SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
@@ -115,41 +106,6 @@ def _fresh(out: Path) -> Path:
     return data
 
 
-@contextmanager
-def beside(work: Callable[..., Made], *given: Any, **options: Any) -> Iterator[Callable[[], Made]]:
-    """A call that returns what `work`, a module's function, makes of what is given, or raises as it does.
-
-    A process of its own works from now on, where there is a core for it; else the work is done in the call. It ends
-    with the context: where this process gives up, nobody waits for the other.
-    """
-    whole = partial(work, *given, **options)
-    if len(os.sched_getaffinity(0)) < 2:
-        yield whole
-        return
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_follow_parent) as pool:
-        others = active_children()
-        job = pool.submit(whole)
-        try:
-            yield job.result
-        finally:
-            for worker in active_children():
-                if worker not in others:
-                    worker.terminate()
-
-
-def _follow_parent() -> None:
-    """Leave Ctrl-C to the parent, which then ends this process, and end with it if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
 def last_word(history: WatchHistory, after: float) -> str:
     """The observer's last event from `after` on, in words: why it changed nothing."""
     said = [describe(event)[1] for event in history.events if event.t >= after]
@@ -190,13 +146,13 @@ class Demo:
             if plan is not None:
                 sags |= self._sag(plan, "calibrated", gravity.beta, record.values("position_offset", 0.0))
                 account.note(sag={"poses": len(sag_poses(plan)), **sags})
-            with beside(diagnose, compile_model(arm.path), *recordings) as diagnosed:
-                self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
-                if not bench.creeping:
-                    self._drift(record, model, check)
-                account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-                gap, bus = diagnosed(), link.stats
+            self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
+            if not bench.creeping:
+                self._drift(record, model, check)
+            bus = link.stats
             link.disable()
+        account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
+        gap = diagnose(compile_model(arm.path), *recordings)
         self.store.close()
         account.find(sentence(gap))
         account.sections += gap_sections(gap)
