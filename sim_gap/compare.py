@@ -29,8 +29,6 @@ from sim_gap.residuals.residual_set import residual_sets
 
 RESAMPLED = 2000
 """Samples of a bootstrap over windows (Efron and Tibshirani 1993: a thousand and more for the ends of an interval)."""
-ALIKE = 0.01
-"""Relative difference of two gaps that is none to a user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +49,8 @@ class ModelGap:
 
     @property
     def alike(self) -> bool:
-        """Whether these recordings do not tell it from the best."""
-        return self.over_best[0] <= 1.0 + ALIKE
+        """Whether these recordings do not tell it from the best by more than 1 %."""
+        return self.over_best[0] <= 1.01
 
 
 @dataclass(frozen=True, eq=False)

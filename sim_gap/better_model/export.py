@@ -12,7 +12,7 @@ import numpy as np
 from armlink.content.atomic_file import write_whole, writing
 from calib.arm.model_files import URDF, urdf_of, xml_comment
 from gcomp.arm.inertials import body_parameters, fixed_body_parameters, pseudo_inertia, set_body, write_bodies
-from gcomp.arm.model_file import linear_part
+from gcomp.arm.model_file import linear_part, links_of_bodies
 from gcomp.arm.rigid_body import CREEP
 from gcomp.arrays import Array
 from sim_gap.better_model import forward_effects
@@ -20,7 +20,7 @@ from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.effects.torque import GRADUAL, is_gradual
-from sim_gap.model.load import SimModel, links_of_bodies, named_spec, urdf_behind
+from sim_gap.model.load import SimModel, named_spec, urdf_behind
 from sim_gap.search.column_store import inertial_change
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
@@ -52,8 +52,6 @@ HELD = {
 """Effects that a MuJoCo model can hold, and the element that holds them."""
 OF_READING = ("position.gain", "position.eccentricity")
 """Errors of a reading that a MuJoCo model cannot hold; an offset beside them is left to the module, too."""
-LEFT_KG = 1e-9
-"""Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +78,27 @@ def with_effects(
     `mount` about the last joint's axis [rad].
     """
     chosen = estimate.terms if terms is None else tuple(terms)
-    model = _base(sim, estimate, chosen)
+    model = copy.copy(sim.mujoco_model)
+    if sim.path is not None and any(term.effect == "transmission.coupling" for term in chosen):
+        spec = named_spec(sim)
+        add_motors(spec, sim, estimate, chosen)
+        model = spec.compile()
     bent = {term.place for term in chosen if term.effect in OF_READING}
     left_out = {
         *(term for term in chosen if term.effect == "transmission.coupling" and sim.path is None),
         *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
     }
     held = tuple(term for term in chosen if term.effect in HELD and term.present(number) and term not in left_out)
-    turn = mount_matrix(sim.arm.axis[-1], mount)
-    links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
-    changed = _set_links(model, sim, links, number)
+    turn, inertial = mount_matrix(sim.arm.axis[-1], mount), sim.arm.inertial.copy()
+    for term in held:
+        body = term.effect == "link.payload"
+        change = inertial_change(term, turn @ estimate.of(term) if body else estimate.of(term), inertial, number)
+        if change is not None:
+            inertial[sim.n - 1 if body else term.place] += change
+    added = inertial - sim.arm.inertial
+    moved = np.flatnonzero(np.any(added != 0.0, axis=1)).tolist()
+    exact = [_set_link(model, sim.joints, link, added[link]) for link in moved]
+    changed = tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
     for term in held:
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
@@ -99,18 +108,6 @@ def with_effects(
     for place, offset in offsets(estimate, held).items():
         _move_zero(model, sim.joints[place], offset)
     return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
-
-
-def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], number: int) -> tuple[str, ...]:
-    """Put the terms that change links into the model; the joints whose link could not be made as fitted."""
-    inertial = sim.arm.inertial.copy()
-    for term, c in terms:
-        change = inertial_change(term, c, inertial, number)
-        if change is not None:
-            inertial[sim.n - 1 if term.effect == "link.payload" else term.place] += change
-    moved = np.flatnonzero(np.any(inertial != sim.arm.inertial, axis=1)).tolist()
-    exact = [_set_link(model, sim.joints, link, inertial[link] - sim.arm.inertial[link]) for link in moved]
-    return tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
 
 
 def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
@@ -129,22 +126,13 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
         whole = total + sum(beside, np.zeros(10))
         if fixed and may_exist(whole):
             total = whole
-            for other in fixed:
-                model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
+            for other in fixed:  # nearly nothing, since MuJoCo takes no body without a mass
+                model.body_mass[other], model.body_inertia[other] = 1e-9, 1e-9
     return set_body(model, body, anchor, total)
 
 
 def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
-
-
-def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> Any:
-    """A copy of the nominal model with its coupled motors, which only a model from a file can have."""
-    if sim.path is None or not any(term.effect == "transmission.coupling" for term in terms):
-        return copy.copy(sim.mujoco_model)
-    spec = named_spec(sim)
-    add_motors(spec, sim, estimate, terms)
-    return spec.compile()
 
 
 def write_changes(spec: Any, sim: SimModel, model: Any) -> None:

@@ -56,15 +56,9 @@ PASSIVE = (
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
 """Length of a forward simulation from a recorded state, number of them over a recording, largest time step, also of a
 model whose actuators have delays."""
-AROUND_S = 0.06
-"""The state at the start of a simulation is that of a parabola through the readings this close to it [s]."""
 LOST, WILD = np.pi, 50.0
 """Limits of a joint's deviation [rad] and speed [rad/s]: without friction and rotor inertia a light joint would diverge
 and the simulation with it."""
-LOCKED = 1e9
-"""Armature of joints of the model that the recording does not have [kg·m²]: they stay at rest."""
-RESTING = 1e-4
-"""Speed below which a joint is at rest [rad/s], and its motor torque sets the direction of friction."""
 
 
 class Effects:
@@ -121,7 +115,7 @@ class Effects:
         fade = xp.exp(-((speed / self.values("friction.stribeck", "velocity", 1.0)) ** 2))
         level = self.coulomb + self.values("friction.stribeck", "breakaway") * fade
         level = level + self.values("friction.load", "coefficient") * xp.abs(carried)
-        heading = xp.where(xp.abs(speed) < RESTING, xp.sign(driven), xp.sign(speed))
+        heading = xp.where(xp.abs(speed) < 1e-4, xp.sign(driven), xp.sign(speed))  # at rest the motor sets it
         level = level * (1.0 + self.values("friction.asymmetric", "ratio") * heading)
         level = level + self.values("friction.bearing", "torque")
         angle = self.values("transmission.ripple", "cycles") * position
@@ -268,12 +262,15 @@ def roll_out(
     `t` (K,) and readings (K, n) as recorded; `source` as in `Effects.drive`. NaN if the recording is shorter than a
     window. The model's contacts and limits are switched off; joints that the recording does not have are locked.
     """
-    _prepare(model, effects)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.dof_armature[np.setdiff1d(np.arange(model.nv), effects.dofs)] = 1e9  # locked: they stay at rest
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1], step)
     q, tau = (_even(even, t, values) for values in (position, torque))
     drive = effects.drive(even - even[0], tau, source)
-    steps, beside = round(horizon / step), max(2, round(AROUND_S / step))
+    # the state at the start is that of a parabola through the readings within 60 ms of it
+    steps, beside = round(horizon / step), max(2, round(0.06 / step))
     last = len(even) - steps - beside - 1
     if last <= beside:
         return np.full(len(effects.joints), np.nan)
@@ -298,12 +295,6 @@ def roll_out(
 def _even(even: Array, t: Array, values: Array) -> Array:
     columns = [np.interp(even, t[there := np.isfinite(x)], x[there]) for x in values.T]
     return np.column_stack(columns)
-
-
-def _prepare(model: Any, effects: Effects) -> None:
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-    model.dof_armature[np.setdiff1d(np.arange(model.nv), effects.dofs)] = LOCKED
 
 
 def _window(

@@ -1,6 +1,9 @@
 """Diagnoses the recordings of a fleet on a cluster of workers, and those of one arm in turn."""
 
+from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
+from statistics import median_high
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -48,37 +51,34 @@ def diagnose_fleet(
 
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.extras import require_extra
+    from sim_gap import fleet
     from sim_gap.better_model.training_files import write_parquet
-    from sim_gap.fleet import Answers, CaseOptions, cluster, diagnose_fleet, find_cases, open_to_all
-    from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
-    from sim_gap.trends import rows as rows_of
 
     require_extra("diagnose-fleet", "cluster")
     if table is not None:
         require_extra("--table", "parquet")
-    options = CaseOptions(stated, gains, base, tip)
-    cases = find_cases(folder, sim)
-    answers = Answers(out or folder / "answers.jsonl", options)
+    options = fleet.CaseOptions(stated, gains, base, tip)
+    cases = fleet.find_cases(folder, sim)
+    answers = fleet.Answers(out or folder / "answers.jsonl", options)
     left = [case for case in cases if case.name not in answers.found]
     console = PlainConsole()
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
     _say_other_options(answers, console)
-    if left and open_to_all(scheduler):
-        console.print(open_to_all(scheduler), style="yellow")
+    if left and (warning := fleet.open_to_all(scheduler)):
+        console.print(warning, style="yellow")
     if left:
-        with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
+        with fleet.cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
             task = bars.add_task("diagnosing", total=len(left))
-            for name, answer in diagnose_fleet(left, client, options):
+            for name, answer in fleet.diagnose_fleet(left, client, options):
                 answers.add(name, answer)
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
-    rows = table_of(found)
-    out_console = results(json)
+    rows, out_console = fleet.table(found), results(json)
     _show(rows, out_console)
-    trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
+    trends, outliers = ([asdict(each) for each in every] for every in (fleet_trends(found), fleet_outliers(found)))
     show_changes(trends, outliers, out_console)
     failed = sum("error" in answer for answer in found.values())
     out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
@@ -92,16 +92,13 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
     from rich.table import Table
 
     cases = {row["case"]: row["verdict"] for row in rows}
-    verdicts = ", ".join(f"{list(cases.values()).count(v)} {v}" for v in sorted(set(cases.values())))
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(Counter(cases.values()).items()))
     shown = Table("effect", "arms", "cases", "median shrink", title=f"{len(cases)} cases: {verdicts}")
-    effects = sorted({row["effect"] for row in rows if row["effect"]})
-    counts = {e: [row for row in rows if row["effect"] == e] for e in effects}
-    for effect in sorted(effects, key=lambda e: -len(counts[e])):
-        shrinks = sorted(row["shrink"] or 0.0 for row in counts[effect])
-        arms = str(len({row["arm"] for row in counts[effect]}))
-        shown.add_row(
-            effect, arms, str(len({row["case"] for row in counts[effect]})), f"{shrinks[len(shrinks) // 2]:.2f}"
-        )
+    effects = Counter(sorted(row["effect"] for row in rows if row["effect"]))
+    for effect, _ in effects.most_common():
+        own = [row for row in rows if row["effect"] == effect]
+        counts = (str(len({row[key] for row in own})) for key in ("arm", "case"))
+        shown.add_row(effect, *counts, f"{median_high(row['shrink'] or 0.0 for row in own):.2f}")
     console.print(shown)
     for row in rows:
         if row["error"]:
@@ -148,23 +145,23 @@ def trend(
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
     from armlink.commands.plain_console import PlainConsole, results
-    from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
+    from sim_gap import fleet
     from sim_gap.model.load import load_compiled
-    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings, rows
+    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)
-    options = CaseOptions(stated, gains, base, tip)
-    answers = Answers(out or folder / "answers.jsonl", options)
+    options = fleet.CaseOptions(stated, gains, base, tip)
+    answers = fleet.Answers(out or folder / "answers.jsonl", options)
     _say_other_options(answers, PlainConsole())
     newest = ""
-    for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
+    for case in sorted(fleet.find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
         if newest not in answers.found:
-            answers.add(newest, diagnose_case(case, options))
+            answers.add(newest, fleet.diagnose_case(case, options))
         answer = answers.found[newest]
         console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
-    trends = rows(fleet_trends(answers.found))
+    trends = [asdict(each) for each in fleet_trends(answers.found)]
     show_changes(trends, [], console)
     changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
     console.print(f"{_count(len(answers.found), 'recording')}: {needed_recordings(answers.found) or changes}")

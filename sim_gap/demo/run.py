@@ -54,8 +54,6 @@ DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
 """Factor on the sensor's readings; offset added to them [N·m], at most this share of rated torque."""
 QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 """Ordinary work before the drift begins, at most, and after a recalibration [s]."""
-SLOW_SETTLING = 0.5
-"""A joint under MIT gains settles so much later [s]: its host's integral term has to forget the torque of braking."""
 WATCHED = (
     "At every stop the observer compares gravity and sensors. Estimates are relative to the calibration that "
     "was current at that time."
@@ -213,7 +211,8 @@ class Demo:
         name, offset = link.names[joint], min(DRIFT_OFFSET, DRIFT_OFFSET_SHARE * section.joints[joint].rated_torque)
         limits = described.lower, described.upper, np.array([each.max_velocity for each in section.joints])
         own_integral = all(setup.gains is None for setup in link.setups)
-        motion = WorkMotion() if own_integral else WorkMotion(rest=WorkMotion.rest + SLOW_SETTLING)
+        # a joint under MIT gains settles later: its host's integral term has to forget the torque of braking
+        motion = WorkMotion() if own_integral else WorkMotion(rest=WorkMotion.rest + 0.5)
         targets = work_targets(link.position_sent, *limits, link.period, np.random.default_rng([self.seed, 8]), motion)
         start, began, before = np.nan, np.inf, (0.0, 0.0)
 

@@ -12,7 +12,7 @@ from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import add_actuator, compile_spec, is_urdf, read_model
 from gcomp.arm.inertials import fixed_body_parameters
-from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
+from gcomp.arm.model_file import HAND, coupled_joints, linear_part, links_of_bodies, upwards
 from gcomp.arm.rigid_body import RigidArm, Tendons
 from gcomp.arrays import Array
 from sim_gap.model.solver_friction import creep_speeds
@@ -280,12 +280,6 @@ def urdf_behind(path: Path | None) -> Path | None:
     """The URDF file that a model was read from, also by an arm file; None if it is of another kind."""
     source = nominal_model(path) if path is not None and is_arm_file(path) else path
     return source if isinstance(source, Path) and is_urdf(source) else None
-
-
-def links_of_bodies(model: Any, joints: Sequence[int]) -> list[int]:
-    """The link, of those that the joints move, that each body belongs to; −1 for one that none carries."""
-    moved = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
-    return [next((moved[up] for up in upwards(model, body) if up in moved), -1) for body in range(model.nbody)]
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:

@@ -331,11 +331,11 @@ def answers(_: Path) -> list[Seed]:
 
 def read_answers(path: Path) -> None:
     from sim_gap.fleet import table
-    from sim_gap.trends import fleet_trends, rows
+    from sim_gap.trends import fleet_trends
 
     found = Answers(path).found
     table(found)
-    rows(fleet_trends(found))
+    fleet_trends(found)
 
 
 KINDS = {
