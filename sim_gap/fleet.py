@@ -18,7 +18,10 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from armlink.content.atomic_file import writing
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
+from armlink.recording.files import load_recording
+from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import parse_known_gains
+from sim_gap.trends import watched_parameters
 
 
 def open_to_all(scheduler: str | None) -> str:
@@ -132,10 +135,6 @@ NO_OPTIONS = CaseOptions()
 
 def diagnose_case(case: Case, options: CaseOptions = NO_OPTIONS) -> dict[str, Any]:
     """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
-    from armlink.recording.files import load_recording
-    from sim_gap.attribution.diagnose import diagnose
-    from sim_gap.trends import watched_parameters
-
     paths = [*case.train, *case.heldout]
     try:
         recordings = [load_recording(path, options.stated.of_reading()) for path in paths]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from armlink.content.atomic_file import write_whole, writing
@@ -113,8 +114,6 @@ def with_effects(
 def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
     """Add ten parameters to the body that a joint moves, or to it with all that is fixed to it if it alone could not
     exist (a gripper taken away); whether the result is what was wanted."""
-    import mujoco
-
     joint = joints[link]
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
     total = body_parameters(model, body, anchor, np.eye(3)) + added

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from scipy import constants
 
@@ -182,8 +183,6 @@ def _steiner(point: Array) -> Array:
 
 def compile_arm(arm: BenchArm) -> Any:
     """The arm's links and rotors as a MuJoCo model without friction, damping or limits."""
-    import mujoco
-
     model, off = mujoco.MjModel.from_xml_string(mjcf(arm)), mujoco.mjtDisableBit
     for part in ("CONSTRAINT", "CONTACT", "SENSOR", "ACTUATION", "DAMPER", "SPRING"):
         model.opt.disableflags |= int(getattr(off, f"mjDSBL_{part}"))
@@ -192,8 +191,6 @@ def compile_arm(arm: BenchArm) -> Any:
 
 def inverse(model: Any, q: Array, v: Array, a: Array) -> Array:
     """Torques M(q) a + C(q, v) v + ∂V/∂q [N·m] along a trajectory, (K, n) each; rotors as in the model."""
-    import mujoco
-
     data, out = mujoco.MjData(model), np.empty(q.shape)
     qpos, qvel, qacc, torque = data.qpos, data.qvel, data.qacc, data.qfrc_inverse
     for k in range(len(q)):

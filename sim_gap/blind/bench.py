@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from armlink.errors import ArmlinkError, BadInput, Refused
+from armlink.recording.files import load_recording
+from sim_gap.attribution.diagnose import diagnose
 from sim_gap.blind.cases import make_case, write_withheld
 from sim_gap.blind.recipe import recipes, servo_recipes
 from sim_gap.blind.score import answer_name, score, score_positions
@@ -111,9 +113,6 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> Json:
     """The diagnosis of this package on files, with the effects `exclude` removed from its library."""
-    from armlink.recording.files import load_recording
-    from sim_gap.attribution.diagnose import diagnose
-
     parts = ([load_recording(path) for path in paths] for paths in (train, heldout))
     return diagnose(sim, *parts, withhold=exclude).to_json()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
@@ -120,8 +121,6 @@ class TorqueRig(Rig):
 
     def gap(self, trial: Trial) -> Gap:
         """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
-        from scipy.signal import butter, sosfiltfilt
-
         arm, columns = self.scene.arm, trial.columns
         t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RECORDED_HZ)
         even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}

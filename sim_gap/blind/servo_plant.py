@@ -11,6 +11,7 @@ g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 
 from gcomp.arrays import Array
@@ -69,8 +70,6 @@ def servo_targets(law: ServoLaw, command: Array) -> Array:
 def simulate_servos(truth: TrueArm, command: Array, law: ServoLaw) -> Array:
     """Exact readings of the encoders, which are at the motors, of an arm whose servos get a command, at `motion.RATE`
     (K, n) [rad] each."""
-    import mujoco
-
     arm, state = truth.arm, truth.state
     rotor, soft = arm.armature + state.rotor_inertia, state.backlash > 0.0
     model = compile_arm(replace(arm, armature=np.where(soft, 0.0, rotor)))
