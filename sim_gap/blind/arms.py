@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from scipy import constants
 
+from gcomp.arm.inertials import steiner
 from gcomp.arrays import Array
 
 
@@ -54,9 +55,9 @@ class BenchArm:
         """The arm with mass [kg], first moment [kg·m] and inertia about the link's origin [kg·m²] added to one link."""
         total = self.mass[link] + mass
         com = (self.mass[link] * self.com[link] + moment) / total
-        about_origin = self.inertia[link] + self.mass[link] * _steiner(self.com[link]) + inertia
+        about_origin = self.inertia[link] + self.mass[link] * steiner(self.com[link]) + inertia
         heavier = self.with_entry("mass", link, total).with_entry("com", link, com)
-        return heavier.with_entry("inertia", link, about_origin - total * _steiner(com))
+        return heavier.with_entry("inertia", link, about_origin - total * steiner(com))
 
     def with_entry(self, quantity: str, joint: int, value: float | Array) -> "BenchArm":
         """The arm with another value of one link or joint in the array `quantity`."""
@@ -175,10 +176,6 @@ def _rod(mass: float, bone: Array, random: np.random.Generator) -> Array:
     rod = across * (np.eye(3) - np.outer(along, along)) + axial * np.outer(along, along)
     turn = _about_x(random.normal(0.0, 0.15))
     return np.asarray(turn @ rod @ turn.T)
-
-
-def _steiner(point: Array) -> Array:
-    return np.asarray(point @ point * np.eye(3) - np.outer(point, point))
 
 
 def compile_arm(arm: BenchArm) -> Any:

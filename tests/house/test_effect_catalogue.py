@@ -10,7 +10,7 @@ from calib.fit import unmodelled_effects
 from calib.observer.cause_test import CAUSES
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
-from sim_gap.blind.effects import DRAWS, NOT_DRAWN
+from sim_gap.blind.effects import DRAWS
 from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.effects.registry import NOT_DIAGNOSED, effects, library_without
 
@@ -19,7 +19,7 @@ ID = re.compile(r"`([a-z]+\.[a-z_]+)`")
 FORMS = {
     "forward": (set(forward_effects()), NOT_SIMULATED),
     "inverse": (set(library_without([])), NOT_DIAGNOSED),
-    "blind": (set(DRAWS), NOT_DRAWN),
+    "blind": (set(DRAWS), NOT_SIMULATED),
 }
 
 
