@@ -28,8 +28,8 @@ MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Made = TypeVar("Made")
 Json = dict[str, Any]
-Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], Json]
-"""Model, training and held-out recordings, effects withheld → the answer as in docs/formats.md."""
+Diagnose = Callable[[Path, Sequence[str]], Json]
+"""Folder of a case, effects withheld → the answer as in docs/formats.md."""
 Progress = Callable[[str, int, int], None]
 """Stage, number of those that are done, number of all."""
 
@@ -58,7 +58,7 @@ def run_bench(
     for done in make_cases(out, seed, cases, workers, lengths, effects, positions):
         progress("making cases", done, cases)
     made = time.monotonic()
-    jobs = {answer_name(*task): partial(diagnose_case, diagnose, out / "cases", *task) for task in tasks(out)}
+    jobs = {answer_name(case, *less): partial(diagnose, out / "cases" / case, less) for case, *less in tasks(out)}
     digest = seal_answers(out / "answers", jobs, workers, progress)
     answered = time.monotonic()
     answers, labels = open_labels(out / "answers", out / "labels", digest)
@@ -101,26 +101,19 @@ def make_cases(
     write_withheld(labels, positions)
 
 
-def tasks(out: Path) -> list[tuple[str, str]]:
-    """(case, effect withheld or nothing) of every diagnosis to run.
+def tasks(out: Path) -> list[list[str]]:
+    """Case, and effect withheld if there is one, of every diagnosis to run.
 
     The effects to withhold are listed in `labels/withhold.txt`; no label is opened for them.
     """
-    lines = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
-    withheld = [(case, effect) for case, effect in (line.split() for line in lines)]
-    return [*((path.name, "") for path in sorted((out / "cases").iterdir())), *withheld]
+    withheld = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
+    return [*([path.name] for path in sorted((out / "cases").iterdir())), *(line.split() for line in withheld)]
 
 
-def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> Json:
-    """The diagnosis of this package on files, with the effects `exclude` removed from its library."""
-    parts = ([load_recording(path) for path in paths] for paths in (train, heldout))
-    return diagnose(sim, *parts, withhold=exclude).to_json()
-
-
-def diagnose_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> Json:
-    folder = cases / case
-    less = [withheld] if withheld else []
-    return diagnose(folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], less)
+def diagnose_folder(folder: Path, withheld: Sequence[str]) -> Json:
+    """The diagnosis of this package on the files of a case, with these effects removed from its library."""
+    train, heldout = ([load_recording(folder / f"{name}.csv")] for name in ("train", "heldout"))
+    return diagnose(folder / "sim.xml", train, heldout, withhold=withheld).to_json()
 
 
 def seal_answers(

@@ -1,6 +1,6 @@
 """The bench of real arms: recordings of a folder, diagnosed and sealed before what is known of the arms is read.
 
-What is known stands in `real_arms.yaml`, or in a file of the same form that is given: effects that an arm has (`has`),
+What is known stands in `real_arms.yaml`: effects that an arm has (`has`),
 of which one has to come first, those that have to be named, and those that nobody knows (`open`), which do not count.
 """
 
@@ -33,7 +33,7 @@ def run_real(
     bench.
     """
     refuse_earlier(out)
-    cases = read_cases(known)
+    cases: list[Json] = read_yaml(known)
     missing = [case["case"] for case in cases if not all((folder / name).is_file() for name in _files(case))]
     here = [case for case in cases if case["case"] not in missing]
     if not here:
@@ -42,21 +42,6 @@ def run_real(
     jobs = {answer_name(case["case"], effect): partial(diagnose_real, folder, case, effect) for case, effect in tasks}
     digest = seal_answers(out / "answers", jobs, workers, progress)
     return {**score_real(verify(out / "answers", digest), here), "sealed": digest, "missing": missing}
-
-
-def read_cases(known: Path) -> list[Json]:
-    """The cases of a file, in the form of `real_arms.yaml`. Raises BadInput if it is not of that form."""
-    try:
-        cases = read_yaml(known)
-    except OSError as error:
-        raise BadInput(f"{known}: cannot be read: {error.strerror}") from None
-    for number, case in enumerate(cases if isinstance(cases, list) else [cases], start=1):
-        lacking = [key for key in ("case", "sim", "train") if not isinstance(case, dict) or key not in case]
-        if isinstance(case, dict) and not case.get("refused"):
-            lacking += [key for key in ("first", "has") if key not in case]
-        if lacking:
-            raise BadInput(f"{known}: entry {number} lacks {', '.join(lacking)}: write the entry as in {KNOWN.name}")
-    return list(cases)
 
 
 def _files(case: Json) -> list[str]:

@@ -27,10 +27,7 @@ def bench(
     ] = "",
     real: Annotated[
         Path | None,
-        _other("Diagnose instead the recordings of real arms in this folder; see --known.", metavar="DIR"),
-    ] = None,
-    known: Annotated[
-        Path | None, _other("YAML file with the known effects of these arms; by default the published arms.")
+        _other("Diagnose instead the recordings of the published arms in this folder.", metavar="DIR"),
     ] = None,
     json: Json = None,
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
@@ -53,8 +50,8 @@ def bench(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
-    from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.real_recordings import KNOWN, run_real
+    from sim_gap.blind.bench import diagnose_folder, run_bench
+    from sim_gap.blind.real_recordings import run_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
         raise BadInput(f"--json {json}: the folder of this file does not exist: create it first")
@@ -71,9 +68,9 @@ def bench(
 
         folder = out or Path(scratch)
         if real is not None:
-            result = run_real(real, folder, known or KNOWN, progress, workers)
+            result = run_real(real, folder, progress=progress, workers=workers)
         else:
-            result = run_bench(diagnose_files, folder, seed, cases, workers, None, progress, effects, positions)
+            result = run_bench(diagnose_folder, folder, seed, cases, workers, None, progress, effects, positions)
     console = results(json)
     if real is not None:
         show_real(result, console)

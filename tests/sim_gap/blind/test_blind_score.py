@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from armlink.errors import BadInput, Refused
-from sim_gap.blind.bench import MANIFEST, diagnose_case, open_labels, run_bench, seal, seal_answers, verify
+from sim_gap.blind.bench import MANIFEST, open_labels, run_bench, seal, seal_answers, verify
 from sim_gap.blind.cases import label_of
 from sim_gap.blind.judge import judge
 from sim_gap.blind.recipe import draw, recipes
@@ -210,15 +210,15 @@ def test_a_broken_seal_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / MANIFEST).exists()
 
 
-def fail(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
-    with (sim.parent.parent / "tried").open("a") as stream:
-        stream.write(sim.parent.name + "\n")
+def fail(folder: Path, withheld: Any) -> dict[str, Any]:
+    with (folder.parent / "tried").open("a") as stream:
+        stream.write(folder.name + "\n")
     raise ZeroDivisionError
 
 
 @pytest.mark.long
 def test_a_diagnosis_that_breaks_ends_the_bench_and_says_where(tmp_path: Path) -> None:
-    jobs = {f"case_{k:04d}": partial(diagnose_case, fail, tmp_path, f"case_{k:04d}", "") for k in range(1000)}
+    jobs = {f"case_{k:04d}": partial(fail, tmp_path / f"case_{k:04d}", []) for k in range(1000)}
     for workers in (1, 2):
         with pytest.raises(ZeroDivisionError) as raised:
             seal_answers(tmp_path / f"answers_{workers}", jobs, workers)
@@ -229,8 +229,8 @@ def test_a_diagnosis_that_breaks_ends_the_bench_and_says_where(tmp_path: Path) -
 def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
     seen = []
 
-    def diagnose(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
-        seen.append((sim.name, train[0].name, heldout[0].name, tuple(exclude)))
+    def diagnose(folder: Path, withheld: Any) -> dict[str, Any]:
+        seen.append(({path.name for path in folder.iterdir()}, withheld))
         assert not (tmp_path / "bench/answers" / MANIFEST).exists()
         if len(seen) == 1:
             raise BadInput("cannot be used")
@@ -239,7 +239,7 @@ def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
     result = run_bench(diagnose, tmp_path / "bench", seed=4, cases=2, workers=1, lengths=(8.0, 5.0))
     assert result["label_withheld"]["cases"] == 2
     assert len(seen) == 2 + result["effect_withheld"]["cases"]
-    assert seen[0][:3] == ("sim.xml", "train.csv", "heldout.csv")
+    assert seen[0] == ({"sim.xml", "train.csv", "heldout.csv"}, [])
     assert len(result["sealed"]) == 64
     with pytest.raises(BadInput, match="earlier check"):
         run_bench(diagnose, tmp_path / "bench", cases=1)
