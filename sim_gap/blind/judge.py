@@ -39,8 +39,8 @@ class Judgement:
     named: bool
     """Whether a true effect is the first or among those confounded with it."""
     tellable: bool
-    found: tuple[str, ...]
-    """True effects among the causes, at any position."""
+    all_found: bool
+    """Whether all true effects are among the causes."""
     blamed: tuple[str, ...]
     """Confident causes that this arm does not have (small true imperfections listed last are excused)."""
     joints: tuple[int, int, int] = (0, 0, 0)
@@ -50,10 +50,9 @@ class Judgement:
     """Claimed relative decrease of the held-out gap at the joint concerned."""
     shrink_true: float = float("nan")
     """Relative decrease of the held-out gap by the true effects."""
-    shown: tuple[str, ...] = ()
-    """Of several effects, those that alone at least double the gap of the sound arm somewhere."""
-    placed: tuple[str, ...] = ()
-    """Of these, the ones among the causes, at one of their true joints."""
+    placed: tuple[bool, ...] = ()
+    """Of several effects, of each that alone at least doubles the gap of the sound arm somewhere: whether a cause names
+    it at one of its true joints."""
     confident: int = 0
     """Number of causes with a confidence above CONFIDENT."""
 
@@ -68,7 +67,6 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
     first = leading[0] if leading else None
     offered = {first["effect"], *(first["confounded_with"] or ())} if first else set()
     shrink, shrink_true = _shrinks(answer, label)
-    shown = _shown(label, truths)
     return Judgement(
         case=label["case"],
         kind=label["kind"],
@@ -80,30 +78,27 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
         first_right=bool(first and first["effect"] in names),
         named=bool(offered & names),
         tellable=bool(truths) and not any(t["undecided"] for t in truths),
-        found=tuple(t["effect"] for t in truths if t["effect"] in {c["effect"] for c in causes}),
+        all_found={t["effect"] for t in label["effects"]} <= names & {c["effect"] for c in causes},
         blamed=_blamed(causes, label, truths, implied),
         joints=_joints(causes, truths),
         errors=tuple(error for t in truths for error in _parameter_errors(causes, t)),
         shrink=shrink,
         shrink_true=shrink_true,
-        shown=tuple(t["effect"] for t in shown),
-        placed=tuple(t["effect"] for t in shown if _placed(causes, t)),
+        placed=_placed(causes, label, truths),
         confident=sum(c["confidence"] > CONFIDENT for c in causes),
     )
 
 
-def _shown(label: Json, truths: Sequence[Json]) -> list[Json]:
+def _placed(causes: Sequence[Json], label: Json, truths: Sequence[Json]) -> tuple[bool, ...]:
     if label["kind"] != "several":
-        return []
+        return ()
     falls = zip(label["effects"], label["gap"]["falls"], strict=True)
-    clear = [t["effect"] for t, fall in falls if fall["before"] > 2.0 * fall["after"]]
-    return [t for t in truths if t["effect"] in clear]
-
-
-def _placed(causes: Sequence[Json], truth: Json) -> bool:
-    """Whether the causes name a true effect at one of its joints."""
-    named = [c for c in causes if c["effect"] == truth["effect"]]
-    return any(not truth["joints"] or set(truth["joints"]) & set(c["joints"]) for c in named)
+    clear = [t for t, fall in falls if t in truths and fall["before"] > 2.0 * fall["after"]]
+    places = [[set(c["joints"]) for c in causes if c["effect"] == t["effect"]] for t in clear]
+    return tuple(
+        any(not t["joints"] or set(t["joints"]) & joints for joints in named)
+        for t, named in zip(clear, places, strict=True)
+    )
 
 
 def _blamed(causes: Sequence[Json], label: Json, truths: Sequence[Json], implied: set[str]) -> tuple[str, ...]:

@@ -25,11 +25,9 @@ def score(answers: Answers, labels: Answers) -> dict[str, Any]:
     """Score all answers (by name, see `answer_name`) against the labels (by case)."""
     judged = judge_all(answers, labels)
     whole = [j for j in judged if not j.withheld]
-    parts = {
-        "label_withheld": label_withheld(whole),
-        "effect_withheld": effect_withheld([j for j in judged if j.withheld]),
-    }
-    return {"schema": SCHEMA, **parts, "meets": meets_bounds(parts), **_tables(judged, calibrated=whole)}
+    hidden, less = label_withheld(whole), effect_withheld([j for j in judged if j.withheld])
+    met = {"label_withheld": hidden, "effect_withheld": less, "meets": meets_bounds(hidden, less)}
+    return {"schema": SCHEMA, **met, "calibration": calibration(whole), **_tables(judged)}
 
 
 def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
@@ -42,17 +40,9 @@ def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
         "named_where_tellable": named is not None and named >= NAMED_SHARE,
         "false_confident": false is not None and false <= FALSE_SHARE,
     }
-    hidden, tables = label_withheld(whole), _tables(judged, calibrated=judged)
-    return {
-        "schema": POSITIONS_SCHEMA,
-        "answers": len(judged),
-        "tellable": len(told),
-        "named_where_tellable": named,
-        "false_confident": false,
-        "label_withheld": hidden,
-        "meets": met,
-        **tables,
-    }
+    shares = {"tellable": len(told), "named_where_tellable": named, "false_confident": false, "meets": met}
+    parts = {"answers": len(judged), **shares, "label_withheld": label_withheld(whole)}
+    return {"schema": POSITIONS_SCHEMA, **parts, "calibration": calibration(judged), **_tables(judged)}
 
 
 def judge_all(answers: Answers, labels: Answers) -> list[Judgement]:
@@ -60,14 +50,9 @@ def judge_all(answers: Answers, labels: Answers) -> list[Judgement]:
     return [judge(answer, labels[case], withheld) for case, withheld, answer in named]
 
 
-def _tables(judged: Sequence[Judgement], calibrated: Sequence[Judgement]) -> dict[str, Any]:
+def _tables(judged: Sequence[Judgement]) -> dict[str, Any]:
     whole = [j for j in judged if not j.withheld]
-    return {
-        "confusion": confusion(whole),
-        "by_effect": by_effect(whole),
-        "calibration": calibration(calibrated),
-        "cases": [case_row(j) for j in judged],
-    }
+    return {"confusion": confusion(whole), "by_effect": by_effect(whole), "cases": [case_row(j) for j in judged]}
 
 
 def answer_name(case: str, withheld: str = "") -> str:
@@ -94,7 +79,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
         "joints": {"precision": precision, "recall": recall, "f1": f1},
         "no_effect": {"cases": len(none), "false_alarms": share([j.verdict != "no_gap" for j in none])},
         "several": score_several([j for j in judged if j.kind == "several"]),
-        "two": {"cases": len(two), "both_found": share([set(j.found) == set(j.truth) for j in two])},
+        "two": {"cases": len(two), "both_found": share([j.all_found for j in two])},
         "parameters": {
             "count": len(errors),
             "median_error": _median(errors),
@@ -108,11 +93,11 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
 
 def score_several(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Shares over the cases with many effects: true effects named, confident causes that are false."""
-    shown, placed = (sum(len(getattr(j, name)) for j in judged) for name in ("shown", "placed"))
+    placed = [each for j in judged for each in j.placed]
     return {
         "cases": len(judged),
-        "effects": shown,
-        "named": _ratio(placed, shown),
+        "effects": len(placed),
+        "named": share(placed),
         "false_confident": _ratio(sum(len(j.blamed) for j in judged), sum(j.confident for j in judged)),
         "explained": share([j.verdict == "explained" for j in judged]),
     }
@@ -179,9 +164,9 @@ def case_row(j: Judgement) -> dict[str, Any]:
     }
 
 
-def meets_bounds(result: Mapping[str, Any]) -> dict[str, bool]:
-    """Whether the score meets each of the project's bounds (for at least 150 cases); a share over no case does not."""
-    known, blind = result["label_withheld"], result["effect_withheld"]
+def meets_bounds(known: Mapping[str, Any], blind: Mapping[str, Any]) -> dict[str, bool]:
+    """Whether labels withheld and effects withheld meet each of the project's bounds (for at least 150 cases); a share
+    over no case does not."""
     least = {
         "first_right_where_tellable": (known["first_right_where_tellable"], 0.93),
         "first_or_confounded": (known["first_or_confounded"], 0.98),
