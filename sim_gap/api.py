@@ -77,15 +77,11 @@ def _recordings(
     role: str, given: RecordingLike | Sequence[RecordingLike], reading: Corrections
 ) -> list[tuple[str, Recording]]:
     """(Label, recording) of each."""
-    items = [given] if isinstance(given, Recording | str | Path) else given
-    if not isinstance(items, Sequence):
-        raise BadInput(f"diagnose: {role}: expected recordings or their paths, not {type(given).__name__}")
-    found = []
-    for number, each in enumerate(items, start=1):
-        if isinstance(each, Recording):
-            found.append((f"{role} {number}", each))
-        elif isinstance(each, str | Path):
-            found.append((str(each), load_recording(each, reading)))
-        else:
+    items = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    for each in items:
+        if not isinstance(each, Recording | str | Path):
             raise BadInput(f"diagnose: {role}: expected recordings or their paths, not {type(each).__name__}")
-    return found
+    return [
+        (f"{role} {k}", each) if isinstance(each, Recording) else (str(each), load_recording(each, reading))
+        for k, each in enumerate(items, start=1)
+    ]

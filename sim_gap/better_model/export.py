@@ -224,8 +224,8 @@ def model_files(
     for joint, drive in drives.items():
         if joint in motors:
             put_drive(motors[joint], drive)
-    if any("actuator.delay" in drive and joint in motors for joint, drive in drives.items()):
-        spec.option.timestep = min(float(spec.option.timestep), STEP_S)
+            if "actuator.delay" in drive:
+                spec.option.timestep = min(float(spec.option.timestep), STEP_S)
     spec.compile()
     left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
     lines = [_line(sim, estimate, term) for term in left]

@@ -1,12 +1,13 @@
 """Tests the diagnosis on sealed cases of simulated arms."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from armlink.commands.options import Json
+from sim_gap.commands.gap_diagnose import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -106,7 +107,7 @@ def show_figures(result: Mapping[str, Any], console: "Console") -> None:
             value = value[key]
         shown.append((text, _percent(value)))
     shown.append(("effect withheld: a wrong effect is named", _percent(result["effect_withheld"]["false_blame"])))
-    _print_table(console, ("figure", "value"), shown, f"blind check, {_counted(result)}")
+    print_table(console, ("figure", "value"), shown, f"blind check, {_counted(result)}")
 
 
 def show_positions(result: Mapping[str, Any], console: "Console") -> None:
@@ -126,10 +127,10 @@ def show_effects(result: Mapping[str, Any], console: "Console") -> None:
         counts = (str(line[key]) for key in ("cases", "first_right", "named"))
         rows.append((effect, *counts, _percent(line["median_error"]), instead))
     header = ("effect", "cases", "right first", "named", "median error", "first effect named instead")
-    _print_table(console, header, rows)
+    print_table(console, header, rows)
     ranges = result["calibration"]
     rows = [(f"{x['from']:.2f} to {x['to']:.2f}", str(x["count"]), _percent(x["right"])) for x in ranges]
-    _print_table(console, ("confidence", "answers", "right"), rows)
+    print_table(console, ("confidence", "answers", "right"), rows)
     missed = [name for name, met in result["meets"].items() if not met]
     console.print("all bounds met" if not missed else f"bounds not met: {', '.join(missed)}")
 
@@ -141,20 +142,11 @@ def show_real(result: Mapping[str, Any], console: "Console") -> None:
         cells = (row["case"], row["withheld"] or "", row["verdict"], row["first"] or "–", sure)
         rows.append((*cells, ", ".join(row["false"]), ", ".join(row["lacking"])))
     header = ("case", "without", "verdict", "first", "confidence", "false above 0.8", "not named")
-    _print_table(console, header, rows)
+    print_table(console, header, rows)
     right, false, named = (_percent(result[key]) for key in ("right_first", "false_confident", "named"))
     console.print(f"right first {right}, a false cause above 0.8 {false}, all known effects named {named}")
     if result["missing"]:
         console.print(f"recordings missing: {', '.join(result['missing'])}")
-
-
-def _print_table(console: "Console", header: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
-    from rich.table import Table
-
-    table = Table(*header, title=title or None)
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
 
 
 def _counted(result: Mapping[str, Any]) -> str:

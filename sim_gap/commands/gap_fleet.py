@@ -10,7 +10,7 @@ import typer
 
 from armlink.commands.options import Json, reads_recordings
 from armlink.commands.output import write_json
-from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
+from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip, print_table
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
@@ -89,32 +89,24 @@ def diagnose_fleet(
 
 
 def _show(rows: list[dict[str, Any]], console: Any) -> None:
-    from rich.table import Table
-
     cases = {row["case"]: row["verdict"] for row in rows}
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(Counter(cases.values()).items()))
-    shown = Table("effect", "arms", "cases", "median shrink", title=f"{len(cases)} cases: {verdicts}")
-    effects = Counter(sorted(row["effect"] for row in rows if row["effect"]))
+    shown, effects = [], Counter(sorted(row["effect"] for row in rows if row["effect"]))
     for effect, _ in effects.most_common():
         own = [row for row in rows if row["effect"] == effect]
         counts = (str(len({row[key] for row in own})) for key in ("arm", "case"))
-        shown.add_row(effect, *counts, f"{median_high(row['shrink'] or 0.0 for row in own):.2f}")
-    console.print(shown)
+        shown.append((effect, *counts, f"{median_high(row['shrink'] or 0.0 for row in own):.2f}"))
+    print_table(console, ("effect", "arms", "cases", "median shrink"), shown, f"{len(cases)} cases: {verdicts}")
     for row in rows:
         if row["error"]:
             console.print(f"{row['case']}: {row['error']}", style="yellow")
 
 
 def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
-    from rich.table import Table
-
     if trends:
-        shown = Table("arm", "effect", "joint", "parameter", "before", "now", "since", "noticed", title="what changes")
-        for one in trends:
-            values = (f"{one['before']:.3g}", f"{one['now']:.3g} {one['unit']}")
-            names = (one["arm"], one["effect"], one["joint"], one["parameter"])
-            shown.add_row(*names, *values, one["since"], one["noticed"])
-        console.print(shown)
+        header = ("arm", "effect", "joint", "parameter", "before", "now", "since", "noticed")
+        texts = [x | {"before": f"{x['before']:.3g}", "now": f"{x['now']:.3g} {x['unit']}"} for x in trends]
+        print_table(console, header, [[each[name] for name in header] for each in texts], "what changes")
     for one in outliers:
         console.print(
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} is {one['value']:.3g} "

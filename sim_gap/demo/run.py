@@ -42,7 +42,7 @@ from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
-from sim_gap.model.load import compile_model
+from sim_gap.model.load import load_compiled
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 
@@ -150,7 +150,7 @@ class Demo:
             bus = link.stats
             link.disable()
         account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-        gap = diagnose(compile_model(arm.path), *recordings)
+        gap = diagnose(load_compiled(arm.path), *recordings)
         self.store.close()
         account.find(sentence(gap))
         account.sections += gap_sections(gap)

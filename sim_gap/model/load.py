@@ -247,13 +247,8 @@ def named_spec(sim: SimModel) -> Any:
 
 
 def load_compiled(source: Any) -> Any:
-    """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
-    return compile_model(Path(source)) if isinstance(source, str | Path) else source
-
-
-def compile_model(path: Path) -> Any:
-    """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
-    return compile_spec(read_spec(path), path)
+    """The `mujoco.MjModel` of an MJCF, URDF or arm file (by path or bundled name), or the one given. Raises BadInput."""
+    return compile_spec(read_spec(Path(source)), Path(source)) if isinstance(source, str | Path) else source
 
 
 def read_spec(path: Path) -> Any:
