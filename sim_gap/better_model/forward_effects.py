@@ -197,25 +197,17 @@ class Effects:
         An elastic transmission or one with backlash shows in the position, whose sensor is at the motor; its
         oscillation is neglected.
         """
-        torque = self.carried(model, data) - self._pushed(data)
+        rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
+        pushed = data.qfrc_constraint.copy()  # by stops and contacts on the links
+        pushed[data.efc_id[rows]] -= data.efc_force[rows]
+        torque = self.carried(model, data) - pushed[self.dofs]
         give = self._give(torque)
         return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
     @property
-    def rigid(self) -> bool:
-        """Whether the position sensors read the joints' own angles, whatever the torque."""
-        return not any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
-
-    def position(self, model: Any, data: Any) -> Array:
-        """Readings of the position sensors after a step [rad], (n,)."""
-        return self.angle(data.qpos[self.places]) if self.rigid else self.read(model, data)[0]
-
-    def _pushed(self, data: Any) -> Array:
-        """Torque of stops and contacts on the links, (n,)."""
-        rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-        push = data.qfrc_constraint.copy()
-        push[data.efc_id[rows]] -= data.efc_force[rows]
-        return np.asarray(push[self.dofs])
+    def gives(self) -> bool:
+        """Whether the reading of a position depends on the torque."""
+        return any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
 
     def angle(self, true: Array) -> Array:
         """The reading φ with true = gain·φ + offset + amplitude·sin(φ + phase), (…, n)."""
@@ -312,14 +304,14 @@ def _window(
     data = mujoco.MjData(model)
     data.qpos[effects.places], data.qvel[effects.dofs] = state
     data.time = time
-    out, speed, rigid = np.empty_like(reading), data.qvel, effects.rigid
+    out, speed, gives = np.empty_like(reading), data.qvel, effects.gives
     for k in range(len(reading)):
         data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
         for _ in range(each):
             mujoco.mj_step(model, data)
             np.minimum(np.maximum(speed, -WILD, out=speed), WILD, out=speed)
-        out[k] = data.qpos[effects.places] if rigid else effects.position(model, data)
-    return np.clip((effects.angle(out) if rigid else out) - reading, -LOST, LOST)
+        out[k] = effects.read(model, data)[0] if gives else data.qpos[effects.places]
+    return np.clip((out if gives else effects.angle(out)) - reading, -LOST, LOST)
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:

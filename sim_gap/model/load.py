@@ -247,7 +247,7 @@ def named_spec(sim: SimModel) -> Any:
 
 
 def load_compiled(source: Any) -> Any:
-    """The `mujoco.MjModel` of an MJCF, URDF or arm file (by path or bundled name), or the one given. Raises BadInput."""
+    """The `mujoco.MjModel` of an MJCF, URDF or arm file, by path or bundled name, or the one given. Raises BadInput."""
     return compile_spec(read_spec(Path(source)), Path(source)) if isinstance(source, str | Path) else source
 
 
