@@ -2,21 +2,27 @@
 
 import shutil
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.text import Text
 
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile
-from armlink.commands.plain_console import command_line, suggest
+from armlink.commands.output import write_json
+from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
 from armlink.content.atomic_file import writing
+from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
+from calib.commands.screen import SweepScreen, print_intervals
 from calib.commissioning.draft import assumed_lines
 from calib.commissioning.model_checks import refuse_impossible_sweep
 from calib.commissioning.new_arm import new_arm
@@ -34,19 +40,21 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.report import calibration
 from calib.report.figures import verify_figure, watch_figure
-from calib.report.page import ReportSection, paragraph
+from calib.report.page import ReportSection, bullets, paragraph, render
+from calib.report.tables import ReportTable, interval_table
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
-from sim_gap.demo.account import Account
+from sim_gap.attribution.diagnosis import plain_json
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
 from sim_gap.model.load import load_compiled
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 
 BY = "armlink demo"
+OPENED = "The fit saw only what came over the bus. The true values were opened only after everything was estimated."
 SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
@@ -82,6 +90,49 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     account.write(out, f"simulated arm {arm.name} with the hidden true values of seed {seed}")
     real = f"{command_line('new', arm_name)} --force --bus socketcan:can0 --by-hand"
     suggest(real if Path(arm_name).suffix else "armlink new MODEL.urdf")
+
+
+class Account:
+    """The demo's account of itself: lines in the terminal, `summary.json` (schema armlink.demo/1), and the page."""
+
+    def __init__(self, json_path: Path | None) -> None:
+        self.summary: dict[str, Any] = {}
+        self.sections: list[ReportSection] = []
+        self._findings, self.began = list[str](), time.monotonic()
+        self._json, self._results, self._console = json_path, results(json_path), PlainConsole()
+
+    def say(self, text: str, style: str = "", console: PlainConsole | None = None) -> None:
+        line = Text.assemble((f"{time.monotonic() - self.began:5.0f} s", "dim"), "  ", (printable_text(text), style))
+        (console or self._console).print(line)
+
+    @contextmanager
+    def stage(self, headline: str) -> Iterator[SweepScreen]:
+        self.say(headline, "bold")
+        with SweepScreen("") as screen:
+            yield screen
+
+    def find(self, text: str) -> None:
+        """A result in a sentence, without a full stop."""
+        self._findings.append(f"{text}.")
+        self.say(text, console=self._results)
+
+    def table(self, title: str, names: tuple[str, ...], columns: Mapping[str, tuple[Array, Array]]) -> ReportTable:
+        """Print a table; returns it for a section. `columns` maps heading to (value, half of its 95 % interval)."""
+        print_intervals(title, names, dict(columns), self._results)
+        return interval_table(names, columns, f"{title}.")
+
+    def note(self, **values: Any) -> None:
+        """Add to the summary: numbers with seven digits, null where one is not finite."""
+        self.summary |= plain_json(values, digits=7)
+
+    def write(self, out: Path, subtitle: str) -> None:
+        """Write `report.html` and `summary.json`; raises OSError."""
+        short = ReportSection("In short", paragraph(OPENED) + bullets(self._findings))
+        render(out / "report.html", "armlink demo", [short, *self.sections], subtitle)
+        summary = {"schema": "armlink.demo/1", **self.summary}
+        for path in (out / "summary.json", self._json):
+            write_json(path, summary)
+        self.say(f"done: open {out / 'report.html'}; the numbers are in {out / 'summary.json'}", console=self._results)
 
 
 def quick(arm: ArmFile) -> ArmFile:
