@@ -15,8 +15,7 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.blind.bench import Json, Progress, refuse_earlier, seal_answers, verify
-from sim_gap.blind.judge import CONFIDENT
-from sim_gap.blind.score import WITHHELD, answer_name, share
+from sim_gap.blind.score import CONFIDENT, WITHHELD, answer_name, share
 
 SCHEMA = "armlink.real-bench/1"
 KNOWN = Path(__file__).with_name("real_arms.yaml")

@@ -10,9 +10,8 @@ import pytest
 from armlink.errors import BadInput, Refused
 from sim_gap.blind.bench import MANIFEST, open_labels, run_bench, seal, seal_answers, verify
 from sim_gap.blind.cases import label_of
-from sim_gap.blind.judge import judge
 from sim_gap.blind.recipe import draw, recipes
-from sim_gap.blind.score import answer_name, score
+from sim_gap.blind.score import answer_name, judge, score
 
 
 def truth(effect: str, joint: str = "joint_2", undecided: str = "", **parameters: float) -> dict[str, Any]:
