@@ -18,7 +18,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from armlink.content.atomic_file import writing
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
-from armlink.recording.files import load_recording
+from armlink.recording.files import SUFFIXES, load_recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import parse_known_gains
 from sim_gap.trends import watched_parameters
@@ -69,7 +69,6 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
 
 
 MODELS = ("sim.xml", "sim.urdf", "sim.yaml")
-SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import Internals
@@ -179,7 +180,7 @@ def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
     for (effect, joint, parameter), arms in latest.items():
         values = np.array([value for value, _ in arms.values()])
         middle = float(np.median(values))
-        spread = 1.4826 * float(np.median(np.abs(values - middle)))
+        spread = float(median_abs_deviation(values, scale="normal"))
         for arm, (value, unit) in arms.items() if len(arms) >= ARMS else ():
             if abs(value - middle) > max(SURE * spread, DIFFERS * abs(middle)):
                 out.append(Outlier(arm, effect, joint, parameter, unit, value, middle))
@@ -247,8 +248,7 @@ def _scatter(one: _Series) -> tuple[float, int, float]:
     steps = np.diff(there)
     if len(steps) < 2:
         return 0.0, 0, size
-    own = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2.0)
-    return float(own), len(steps), size
+    return float(median_abs_deviation(steps, scale="normal") / np.sqrt(2.0)), len(steps), size
 
 
 def _window(one: _Series, part: slice) -> float:

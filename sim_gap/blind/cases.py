@@ -146,7 +146,7 @@ class ServoRig(Rig):
 
     def __init__(self, drawing: CaseDrawing) -> None:
         super().__init__(drawing)
-        arm, law = drawing.nominal, drawing.scene.law
+        arm, law = self.scene.arm, self.scene.law
         assert law is not None
         self.law, self.limit, self.hz = law, 2.0 * self.scene.rated, float(drawing.random.choice((50.0, 100.0)))
         self.encoder_step = 2 * np.pi / 2 ** int(drawing.random.integers(12, 16))
@@ -244,7 +244,7 @@ def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
 
 def label_of(drawing: CaseDrawing, totals: Totals) -> dict[str, Any]:
     """The true effects of the case, for the score; `totals` of the arm with these effects."""
-    chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
+    chirp, nominal = "chirp" in drawing.motions["train"], drawing.scene.arm
     effects = [
         {
             "effect": d.effect,

@@ -70,10 +70,6 @@ class CaseDrawing:
     random: np.random.Generator
     """Source of everything else that is drawn for the case."""
 
-    @property
-    def nominal(self) -> BenchArm:
-        return self.scene.arm
-
 
 def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> list[CaseRecipe]:
     """`count` cases: every effect in turn, and among them arms without an effect and with two effects.

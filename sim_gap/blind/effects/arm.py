@@ -8,7 +8,7 @@ import numpy as np
 
 from gcomp.arm.inertials import steiner
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.arms import BenchArm, compile_arm, inverse
 from sim_gap.blind.effects.drawn_effect import (
     ArmSetting,
     Draw,
@@ -290,7 +290,8 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
         moved = arm.with_moved(link, moment)
-        weighs = rms(scene.change_at_rest(moved))[link] > 0.1 * _felt(scene, moved, link)
+        weight = inverse(compile_arm(moved), scene.motion[0], *np.zeros((2, *scene.torque.shape))) - scene.gravity
+        weighs = rms(weight)[link] > 0.1 * _felt(scene, moved, link)
         why = "" if weighs else "the axis is vertical: a moved mass shows only in its inertia"
         others = () if weighs else ("link.inertia",)
         values = {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}
