@@ -6,7 +6,7 @@ Pieces move single joints and all together. A file of planned motion is CSV with
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,46 +34,8 @@ TONES, BAND, FADE_S = 4, (0.08, 0.6), 2.0
 [s]."""
 
 
-@dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """Position targets of an arm, one per cycle."""
-
-    names: tuple[str, ...]
-    rate: float
-    target: Array
-    """(K, n) [rad]."""
-    pieces: tuple[str, ...]
-    """Description of each part."""
-
-    @property
-    def seconds(self) -> float:
-        return len(self.target) / self.rate
-
-
-def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> PlannedMotion:
-    """Each joint (or those named) alone, slow and fast in both directions, with the others in `poses` poses; then all.
-
-    Constant speeds from creeping to fast separate the kinds of friction, reversals under two loads separate friction
-    from load-dependent effects and backlash, and the sines of all joints separate inertia, rotor and lag. Raises
-    BadInput for a joint that the arm does not have.
-    """
-    shape = _Shape(arm)
-    names = list(shape.names)
-    for joint in joints:
-        if joint not in names:
-            raise BadInput(f"there is no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
-    chosen = [names.index(joint) for joint in dict.fromkeys(joints)] or list(range(len(names)))
-    random = np.random.default_rng(seed)
-    for pose in range(poses):
-        share = random.uniform(0.15, 0.85, len(names)) if pose else np.full(len(names), 0.5)
-        for number in chosen:
-            shape.turn(number, shape.low + share * (shape.high - shape.low))
-    shape.sines(chosen, random)
-    return PlannedMotion(shape.names, shape.rate, np.concatenate(shape.rows), tuple(shape.pieces))
-
-
-class _Shape:
-    """The motion under construction; it starts in the middle of all ranges, and keeps 12 % of each from its ends."""
+    """Position targets of an arm, one per cycle, from the middle of all ranges on, 12 % of each range from its ends."""
 
     def __init__(self, arm: ArmFile) -> None:
         section, described = arm.require_link(), gcomp_arm(arm)
@@ -84,6 +46,16 @@ class _Shape:
         self.here = (self.low + self.high) / 2
         self.rows: list[Array] = [self.here[None]]
         self.pieces: list[str] = []
+        """Description of each part."""
+
+    @property
+    def target(self) -> Array:
+        """(K, n) [rad]."""
+        return np.concatenate(self.rows)
+
+    @property
+    def seconds(self) -> float:
+        return len(self.target) / self.rate
 
     def go(self, goal: Array, motion: WorkMotion = MOVES) -> None:
         """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
@@ -117,6 +89,28 @@ class _Shape:
         self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
 
 
+def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> PlannedMotion:
+    """Each joint (or those named) alone, slow and fast in both directions, with the others in `poses` poses; then all.
+
+    Constant speeds from creeping to fast separate the kinds of friction, reversals under two loads separate friction
+    from load-dependent effects and backlash, and the sines of all joints separate inertia, rotor and lag. Raises
+    BadInput for a joint that the arm does not have.
+    """
+    motion = PlannedMotion(arm)
+    names = list(motion.names)
+    for joint in joints:
+        if joint not in names:
+            raise BadInput(f"there is no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
+    chosen = [names.index(joint) for joint in dict.fromkeys(joints)] or list(range(len(names)))
+    random = np.random.default_rng(seed)
+    for pose in range(poses):
+        share = random.uniform(0.15, 0.85, len(names)) if pose else np.full(len(names), 0.5)
+        for number in chosen:
+            motion.turn(number, motion.low + share * (motion.high - motion.low))
+    motion.sines(chosen, random)
+    return motion
+
+
 def multisine(t: Array, reach: Array, speed: Array, band: tuple[float, float], draw: Array) -> Array:
     """Way from a middle (K, n) [rad], from rest to rest at even times: of each joint sines with frequencies of a band
     [Hz], within its reach [rad] and speed [rad/s], (n,), and MOVES' acceleration; by random numbers (n, 2, sines).
@@ -147,8 +141,9 @@ def save_motion(motion: PlannedMotion, path: Path) -> None:
     """Write `.csv`; raises BadInput if it cannot be written."""
     if path.suffix != ".csv":
         raise BadInput(f"{path}: a motion is written as .csv")
-    columns = {"t": np.arange(len(motion.target)) / motion.rate}
-    columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
+    target = motion.target
+    columns = {"t": np.arange(len(target)) / motion.rate}
+    columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(target.T)}
     with writing(path), open_whole(path) as stream:
         write_numbers(stream, columns)
 

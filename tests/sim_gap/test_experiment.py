@@ -15,7 +15,7 @@ from sim_gap.experiment import (
     LONGEST,
     MOVES,
     SPEEDS,
-    _Shape,
+    PlannedMotion,
     collect,
     joints_in_doubt,
     load_motion,
@@ -52,7 +52,7 @@ def test_each_joint_turns_both_ways_at_every_speed_alone() -> None:
 
 def test_a_slow_joint_turns_through_a_part_of_its_range() -> None:
     """As far as it gets in the longest time, about the middle."""
-    shape = _Shape(load_arm("sarcos"))
+    shape = PlannedMotion(load_arm("sarcos"))
     shape.fastest = 0.004 * (shape.high - shape.low)
     shape.turn(3, shape.here)
     q = np.concatenate(shape.rows)[:, 3]
