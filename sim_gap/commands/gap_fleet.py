@@ -14,6 +14,7 @@ from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip, print_table
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
+    from sim_gap.fleet import Answers, CaseOptions
 
 
 @reads_recordings
@@ -60,13 +61,11 @@ def diagnose_fleet(
         require_extra("--table", "parquet")
     options = fleet.CaseOptions(stated, gains, base, tip)
     cases = fleet.find_cases(folder, sim)
-    answers = fleet.Answers(out or folder / "answers.jsonl", options)
+    answers, console = _opened(out or folder / "answers.jsonl", options), PlainConsole()
     left = [case for case in cases if case.name not in answers.found]
-    console = PlainConsole()
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
-    _say_other_options(answers, console)
     if left and (warning := fleet.open_to_all(scheduler)):
         console.print(warning, style="yellow")
     if left:
@@ -136,7 +135,7 @@ def trend(
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
-    from armlink.commands.plain_console import PlainConsole, results
+    from armlink.commands.plain_console import results
     from sim_gap import fleet
     from sim_gap.model.load import load_compiled
     from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings
@@ -144,8 +143,7 @@ def trend(
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)
     options = fleet.CaseOptions(stated, gains, base, tip)
-    answers = fleet.Answers(out or folder / "answers.jsonl", options)
-    _say_other_options(answers, PlainConsole())
+    answers = _opened(out or folder / "answers.jsonl", options)
     newest = ""
     for case in sorted(fleet.find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
@@ -163,13 +161,16 @@ def trend(
     return int("error" in newest_answer)
 
 
-def _say_other_options(answers: Any, console: Any) -> None:
-    if answers.of_other_options:
-        made = "was made" if answers.of_other_options == 1 else "were made"
-        console.print(
-            f"{answers.path}: {_count(answers.of_other_options, 'answer')} {made} with other options; they "
-            "stay in the file, but are not used"
-        )
+def _opened(path: Path, options: "CaseOptions") -> "Answers":
+    """The answers in a file; those that were made with other options are told."""
+    from armlink.commands.plain_console import PlainConsole
+    from sim_gap.fleet import Answers
+
+    answers = Answers(path, options)
+    if number := answers.of_other_options:
+        made = f"{_count(number, 'answer')} {'was' if number == 1 else 'were'} made with other options"
+        PlainConsole().print(f"{path}: {made}; they stay in the file, but are not used")
+    return answers
 
 
 def _count(number: int, noun: str) -> str:

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.scene import Scene, ServoLaw
@@ -41,14 +40,6 @@ class DrawnEffect:
     """Why slow motion may not separate it from another effect; empty if the recording can."""
     confused_with: tuple[str, ...] = ()
     """Effects that are an equally good answer if it is undecided."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a parameter that is not in the catalogue, which has no controllers."""
-        if self.effect not in CATALOGUE and self.effect.startswith("controller."):
-            return
-        known = {name for name, _ in CATALOGUE[self.effect].reported}
-        if unknown := {name for values in self.parameters.values() for name in values} - known:
-            raise ValueError(f"{self.effect}: {', '.join(sorted(unknown))} not in the catalogue")
 
     @property
     def joints(self) -> tuple[str, ...]:
