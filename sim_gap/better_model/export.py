@@ -106,8 +106,12 @@ def with_effects(
             model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
         elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
-    for place, offset in offsets(estimate, held).items():
-        _move_zero(model, sim.joints[place], offset)
+    for place, offset in offsets(estimate, held).items():  # as the sensor counts: stops and spring stay where they are
+        joint = sim.joints[place]
+        adr = model.jnt_qposadr[joint]
+        model.qpos0[adr] -= offset
+        model.jnt_range[joint] -= offset * bool(model.jnt_limited[joint])
+        model.qpos_spring[adr] -= offset * bool(linear_part(model.jnt_stiffness, model.njnt)[joint])
     return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
 
 
@@ -154,16 +158,6 @@ def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
 def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:
     """Offsets of the position sensors that a model holds, by the joint's place [rad]."""
     return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
-
-
-def _move_zero(model: Any, joint: int, offset: float) -> None:
-    """Count the position of a joint as a sensor with this offset does: stops and spring stay where they are."""
-    adr = model.jnt_qposadr[joint]
-    model.qpos0[adr] -= offset
-    if model.jnt_limited[joint]:
-        model.jnt_range[joint] -= offset
-    if linear_part(model.jnt_stiffness, model.njnt)[joint]:
-        model.qpos_spring[adr] -= offset
 
 
 def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:

@@ -50,11 +50,6 @@ def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-def is_visible(fall: dict[str, Any], least: float) -> bool:
-    """Whether the gap caused by an effect exceeds that of every arm clearly."""
-    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
-
-
 @dataclass(frozen=True)
 class Trial:
     """One motion of a true arm."""
@@ -225,7 +220,8 @@ def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
     # channels that are not recorded do not make a case clear
     *alone, sound = [{name: gap for name, gap in each.items() if name not in rig.missing} for each in gaps]
     falls = [largest_fall(each, sound) for each in alone[-len(drawn) :] if drawn]
-    if not (several or all(is_visible(fall, rig.least_fall) for fall in falls)):
+    pairs = [(fall["before"], fall["after"]) for fall in falls]
+    if not (several or all(b > VISIBLE_RATIO * a and b - a > rig.least_fall for b, a in pairs)):
         return False
     training = rig.run(0, drawing.scene.command, drawn)
     if not all(trial.is_steady for trial in (training, *trials)):

@@ -125,7 +125,10 @@ def draw(recipe: CaseRecipe, train_s: float, heldout_s: float, first: int = 0) -
         training += ("chirp",) * bool(random.random() < 0.5)
         scene = Scene(arm, trajectory(training, train_s, limits, random))
         if recipe.servos:
-            scene.law = _servo_law(scene, random)
+            omega, none = 2 * np.pi * random.uniform(2.5, 5.0, arm.n), np.zeros((3, arm.n))
+            damping = 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega
+            unlimited = np.full(arm.n, np.inf)
+            scene.law = ServoLaw(scene.inertia * omega**2, damping, none[0], none[1], unlimited, none[2])
         drawn = _several(recipe.several, scene, random) if recipe.several else _named(recipe.effects, scene, random)
         if drawn is None:
             continue
@@ -164,12 +167,6 @@ def _limits(arm: BenchArm, servos: bool, random: np.random.Generator) -> MotionL
     velocity = np.linspace(random.uniform(0.8, 1.3), random.uniform(1.5, 2.6), arm.n)
     acceleration = np.linspace(random.uniform(2.5, 4.0), random.uniform(6.0, 10.0), arm.n)
     return MotionLimits(arm.lower, arm.upper, velocity, acceleration)
-
-
-def _servo_law(scene: Scene, random: np.random.Generator) -> ServoLaw:
-    omega, zero = 2 * np.pi * random.uniform(2.5, 5.0, scene.arm.n), np.zeros((3, scene.arm.n))
-    damping = 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega
-    return ServoLaw(scene.inertia * omega**2, damping, zero[0], zero[1], np.full(scene.arm.n, np.inf), zero[2])
 
 
 def _compatible(first: DrawnEffect, second: DrawnEffect) -> bool:

@@ -30,11 +30,6 @@ INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2),
 SLOW = "needs steps, a chirp or faster logging"
 
 
-def fifth_of_swing(scene: Scene) -> Array:
-    """A fifth of the range in which a torque mostly lies: a play is drawn for one that swings far beyond it."""
-    return np.asarray(0.2 * np.subtract(*np.quantile(scene.torque, [0.95, 0.05], axis=0)))
-
-
 def has_varying_load(scene: Scene, _: Array) -> Any:
     size = np.abs(scene.torque)
     return (size.std(0) > 0.4 * size.mean(0)) & (rms(size) > 3.0)
@@ -106,7 +101,12 @@ SIZED = (
     SizedDraw("torque.offset", "offset", lambda s, r: s.sensor_level(r) * r.uniform(1.0, 2.0), sound=0.0),
     SizedDraw("torque.gain", "gain", lambda s, r: s.sensor_level(r) / rms(s.torque), 0.06, 0.25, sound=1.0),
     SizedDraw("torque.drift", "rate", lambda s, r: 2.5 * s.sensor_level(r) / s.seconds, sound=0.0),
-    SizedDraw("torque.hysteresis", "width", lambda s, r: 1.4 * s.sensor_level(r), most=fifth_of_swing),
+    SizedDraw(
+        "torque.hysteresis",
+        "width",
+        lambda s, r: 1.4 * s.sensor_level(r),
+        most=lambda s: 0.2 * np.subtract(*np.quantile(s.torque, [0.95, 0.05], axis=0)),  # it swings far beyond a play
+    ),
     SizedDraw(
         "torque.deadband",
         "width",
