@@ -3,10 +3,10 @@
 import json
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -50,8 +50,7 @@ def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One motion of a true arm."""
 
     columns: Columns
