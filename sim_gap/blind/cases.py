@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,6 +150,10 @@ class ServoRig(Rig):
             for name, kp, kv, top in zip(arm.names, law.stiffness, law.damping, self.limit, strict=True)
         ]
         self.sim = mjcf(arm, ["<actuator>", *rows, "</actuator>"] if drawing.recipe.controller_known else ())
+        state = imperfections(arm.names, ())
+        state.coulomb, state.viscous, state.actuator_saturation = arm.frictionloss, arm.damping, self.limit
+        self.nominal = simulate_servos(replace(self.truth(()), arm=arm, state=state), self.held(drawing.heldout), law)
+        """Held-out positions of the nominal model (K, n) [rad]."""
 
     def truth(self, effects: Sequence[DrawnEffect]) -> TrueArm:
         truth = super().truth(effects)
@@ -182,17 +185,9 @@ class ServoRig(Rig):
         rows = round(RATE / self.hz)
         return command[np.arange(len(command)) // rows * rows]
 
-    @cached_property
-    def ideal(self) -> Array:
-        """Held-out positions of the nominal model (K, n) [rad]."""
-        arm = self.scene.arm
-        state = imperfections(arm.names, ())
-        state.coulomb, state.viscous, state.actuator_saturation = arm.frictionloss, arm.damping, self.limit
-        return simulate_servos(replace(self.truth(()), arm=arm, state=state), self.held(self.drawing.heldout), self.law)
-
     def gap(self, trial: Trial) -> Gap:
         """RMS [rad] of held-out positions against those of the nominal model, but for the first second."""
-        return {"q": rms((trial.position - self.ideal)[round(RATE) :]).tolist()}
+        return {"q": rms((trial.position - self.nominal)[round(RATE) :]).tolist()}
 
 
 def make_case(recipe: CaseRecipe, out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
