@@ -56,18 +56,18 @@ class BenchArm:
         total = self.mass[link] + mass
         com = (self.mass[link] * self.com[link] + moment) / total
         about_origin = self.inertia[link] + self.mass[link] * steiner(self.com[link]) + inertia
-        heavier = self.with_entry("mass", link, total).with_entry("com", link, com)
-        return heavier.with_entry("inertia", link, about_origin - total * steiner(com))
+        return self.with_entries(link, mass=total, com=com, inertia=about_origin - total * steiner(com))
 
-    def with_entry(self, quantity: str, joint: int, value: float | Array) -> "BenchArm":
-        """The arm with another value of one link or joint in the array `quantity`."""
-        values = getattr(self, quantity).copy()
-        values[joint] = value
-        return replace(self, **{quantity: values})
+    def with_entries(self, joint: int, **entries: float | Array) -> "BenchArm":
+        """The arm with other values of one link or joint in some of its arrays."""
+        arrays = {name: getattr(self, name).copy() for name in entries}
+        for name, value in entries.items():
+            arrays[name][joint] = value
+        return replace(self, **arrays)
 
     def with_moved(self, link: int, moment: Array) -> "BenchArm":
         """The arm with the centre of mass of one link moved so that its first moment grows by `moment` [kg·m]."""
-        return self.with_entry("com", link, self.com[link] + moment / self.mass[link])
+        return self.with_entries(link, com=self.com[link] + moment / self.mass[link])
 
 
 def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm:

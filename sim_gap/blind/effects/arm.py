@@ -73,7 +73,7 @@ def heavy_rotor(scene: Scene, j: int) -> dict[str, Any]:
     """The nominal arm with a rotor of 12 % of the joint's inertia or more: behind a spring the simulated arm has none
     below a tenth."""
     least = float(0.12 / (1.0 - 0.12) * scene.link_inertia[j])
-    return {"nominal": lambda arm: arm.with_entry("armature", j, max(float(arm.armature[j]), least))}
+    return {"nominal": lambda arm: arm.with_entries(j, armature=max(float(arm.armature[j]), least))}
 
 
 def offset_twin(scene: Scene, j: int) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def _on_coulomb(
     name = scene.arm.names[j]
     settings = ArmSetting("friction.coulomb", name, {"torque": torque}), ArmSetting(effect, name, values)
     if random.random() < 0.5:
-        return on_joint(scene, j, effect, values, nominal=lambda arm: arm.with_entry("frictionloss", j, torque))
+        return on_joint(scene, j, effect, values, nominal=lambda arm: arm.with_entries(j, frictionloss=torque))
     return on_joint(scene, j, effect, values, settings=settings, implied=("friction.coulomb",))
 
 
@@ -254,10 +254,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect:
         ArmSetting("friction.coulomb", names[j], {"torque": coulomb}),
         ArmSetting("friction.viscous", names[j], {"damping": viscous}),
     )
-
-    def without_motor(arm: BenchArm) -> BenchArm:
-        return arm.with_entry("armature", j, 0.0).with_entry("damping", j, 0.0).with_entry("frictionloss", j, 0.0)
-
+    without_motor = partial(BenchArm.with_entries, joint=j, armature=0.0, damping=0.0, frictionloss=0.0)
     own = {"inertia": rotor, "coulomb": coulomb, "viscous": viscous}
     values = {"coefficient": coefficient, "other_joint": float(k + 1), **own}
     implied = tuple(setting.effect for setting in settings[1:])
