@@ -52,25 +52,16 @@ def diagnose(
 
     Raises BadInput if the recordings cannot be used with the model.
     """
-    stated = parse_corrections(
-        columns=_texts(columns),
-        sign=_texts(sign),
-        units=_texts(units),
-        zero=_texts(zero),
-        clock=_texts(clock),
-        effort_is=effort_is,
-        joints=",".join(joints),
-        topic=topic,
-    )
+    given = {"columns": columns, "sign": sign, "units": units, "zero": zero, "clock": clock}
+    words = {
+        option: [f"{column}={value}" for column, value in each.items()] if isinstance(each, Mapping) else each
+        for option, each in given.items()
+    }
+    stated = parse_corrections(header="", **words, effort_is=effort_is, joints=",".join(joints), topic=topic)
     trained, judged = (_recordings(*each, stated.of_reading()) for each in (("train", train), ("heldout", heldout)))
     labels = [label for label, _ in (*trained, *judged)]
     recordings = [recording for _, recording in trained], [recording for _, recording in judged]
     return diagnosis.diagnose(model, *recordings, labels=labels, stated=stated, base=base, tip=tip)
-
-
-def _texts(stated: Stated) -> Sequence[str]:
-    """In the words of the command."""
-    return [f"{column}={value}" for column, value in stated.items()] if isinstance(stated, Mapping) else stated
 
 
 def _recordings(
