@@ -229,15 +229,16 @@ def show(answer: "Diagnosis", console: "Console") -> None:
 
     from sim_gap.report.effect_text import parameter_rows
 
-    effect, rows = Column("effect", no_wrap=True), []
+    rows = []
     for cause in answer.causes:
         joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
         numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
         rows.append((cause.effect, joints, *numbers, ", ".join(cause.confounded_with)))
     if rows:
-        of_cause = effect, "joints", "RMS before", "after", "confidence", "confounded with"
+        of_cause = Column("effect", no_wrap=True), "joints", "RMS before", "after", "confidence", "confounded with"
         print_table(console, of_cause, rows, "causes, on held-out data")
-        of_parameter = effect, "joint", "parameter", "value", Column("95 % interval", no_wrap=True), "unit"
+        effect, interval = (Column(name, no_wrap=True) for name in ("effect", "95 % interval"))
+        of_parameter = effect, "joint", "parameter", "value", interval, "unit"
         parameters = (row for cause in answer.causes for row in parameter_rows(cause))
         print_table(console, of_parameter, parameters, "their parameters")
     values = zip(answer.noise_floor, answer.heldout_before, answer.heldout_after, strict=True)
