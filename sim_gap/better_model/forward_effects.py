@@ -205,7 +205,7 @@ class Effects:
         return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
     @property
-    def gives(self) -> bool:
+    def is_elastic(self) -> bool:
         """Whether the reading of a position depends on the torque."""
         return any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
 
@@ -304,14 +304,14 @@ def _window(
     data = mujoco.MjData(model)
     data.qpos[effects.places], data.qvel[effects.dofs] = state
     data.time = time
-    out, speed, gives = np.empty_like(reading), data.qvel, effects.gives
+    out, speed, elastic = np.empty_like(reading), data.qvel, effects.is_elastic
     for k in range(len(reading)):
         data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
         for _ in range(each):
             mujoco.mj_step(model, data)
             np.minimum(np.maximum(speed, -WILD, out=speed), WILD, out=speed)
-        out[k] = effects.read(model, data)[0] if gives else data.qpos[effects.places]
-    return np.clip((out if gives else effects.angle(out)) - reading, -LOST, LOST)
+        out[k] = effects.read(model, data)[0] if elastic else data.qpos[effects.places]
+    return np.clip((out if elastic else effects.angle(out)) - reading, -LOST, LOST)
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:

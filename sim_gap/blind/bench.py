@@ -96,7 +96,7 @@ def make_cases(
     wanted = servo_recipes(seed, cases) if positions else recipes(seed, cases, several)
     jobs = [partial(make_case, recipe, out / "cases", labels, *seconds) for recipe in wanted]
     yield 0
-    for done, _ in enumerate(_made_apart(jobs, workers), start=1):
+    for done, _ in enumerate(_run_apart(jobs, workers), start=1):
         yield done
     write_withheld(labels, positions)
 
@@ -122,7 +122,7 @@ def seal_answers(
     """Write the answer of each job as `folder/NAME.json` as it comes, then seal all; SHA-256 of the seal."""
     folder.mkdir(parents=True)
     todo = [partial(_answer, name, job) for name, job in jobs.items()]
-    found = _made_apart(todo, workers) if workers > 1 else (job() for job in todo)
+    found = _run_apart(todo, workers) if workers > 1 else (job() for job in todo)
     for done, (name, answer) in enumerate(found, start=1):
         (folder / f"{name}.json").write_text(json.dumps(answer, indent=1, ensure_ascii=False), encoding="utf-8")
         progress("diagnosing", done, len(jobs))
@@ -143,7 +143,7 @@ def _answer(name: str, job: Callable[[], Json]) -> tuple[str, Json]:
     return name, {**answer, "seconds": time.monotonic() - started}
 
 
-def _made_apart(jobs: Sequence[Callable[[], Made]], workers: int) -> Iterator[Made]:
+def _run_apart(jobs: Sequence[Callable[[], Made]], workers: int) -> Iterator[Made]:
     """Results in the order in which they come from `workers` processes."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(job) for job in jobs]

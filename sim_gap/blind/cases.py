@@ -30,7 +30,7 @@ FOLLOWED, SERVO_FOLLOWED = 0.3, 0.6
 """Largest deviation from the command [rad] of an arm under control, and of one with servos."""
 DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
 """Of a column in a file; 5 of the others."""
-WHOLE = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
+JOINT_TOTALS = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
 """Effects of which positions show all that a joint has, with what the model has of it."""
 Columns = dict[str, Array]
 Gap = dict[str, list[float]]
@@ -263,7 +263,7 @@ def _reported(drawn: DrawnEffect, names: Sequence[str], totals: Totals) -> dict[
     """Parameters of an effect as positions alone show them: friction and inertia of a joint with what the model has."""
     for key, values in totals.items():
         effect, _, name = key.partition(":")
-        if effect == drawn.effect and effect in WHOLE:
+        if effect == drawn.effect and effect in JOINT_TOTALS:
             return {joint: {name: values[names.index(joint)]} for joint in drawn.joints}
     return drawn.parameters
 

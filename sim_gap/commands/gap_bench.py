@@ -81,7 +81,7 @@ def bench(
     write_json(json, result)
 
 
-LABELLED = {
+LABEL_FIGURES = {
     "right effect first, if the motion can distinguish it": "first_right_where_tellable",
     "right effect first": "first_right",
     "right effect first or named as confounded": "first_or_confounded",
@@ -101,7 +101,7 @@ LABELLED = {
 
 def show_figures(result: Mapping[str, Any], console: "Console") -> None:
     shown = []
-    for text, path in LABELLED.items():
+    for text, path in LABEL_FIGURES.items():
         value: Any = result["label_withheld"]
         for key in path.split("."):
             value = value[key]

@@ -61,7 +61,7 @@ def diagnose_fleet(
         require_extra("--table", "parquet")
     options = fleet.CaseOptions(stated, gains, base, tip)
     cases = fleet.find_cases(folder, sim)
-    answers, console = _opened(out or folder / "answers.jsonl", options), PlainConsole()
+    answers, console = _open_answers(out or folder / "answers.jsonl", options), PlainConsole()
     left = [case for case in cases if case.name not in answers.found]
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
@@ -143,7 +143,7 @@ def trend(
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)
     options = fleet.CaseOptions(stated, gains, base, tip)
-    answers = _opened(out or folder / "answers.jsonl", options)
+    answers = _open_answers(out or folder / "answers.jsonl", options)
     newest = ""
     for case in sorted(fleet.find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
@@ -161,7 +161,7 @@ def trend(
     return int("error" in newest_answer)
 
 
-def _opened(path: Path, options: "CaseOptions") -> "Answers":
+def _open_answers(path: Path, options: "CaseOptions") -> "Answers":
     """The answers in a file; those that were made with other options are told."""
     from armlink.commands.plain_console import PlainConsole
     from sim_gap.fleet import Answers

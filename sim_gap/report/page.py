@@ -39,7 +39,7 @@ def sections(answer: Diagnosis) -> list[Section]:
     out = [_verdict(answer), _gap(answer)]
     if isinstance(answer.internals, Identified):
         shown = {"Motion of every joint": (MOTION, [motion_figure(answer.internals, answer.causes)])}
-        return out + _shown(shown)
+        return out + _sections_of(shown)
     if answer.internals is None:
         return out
     layout = answer.internals.heldout.layout
@@ -51,17 +51,17 @@ def sections(answer: Diagnosis) -> list[Section]:
             f"The {words} of every joint on held-out data: the measurement, the {nominal}, and the "
             "prediction with the causes added. Click a name to hide or show its curve; “without” leaves one effect out."
         )
-        out += _shown({f"Every joint over time: {words}": (text, [torque_over_time(answer, channel)])})
-    return [*out, *_shown(_explained(answer)), *_residuals(answer)]
+        out += _sections_of({f"Every joint over time: {words}": (text, [torque_over_time(answer, channel)])})
+    return [*out, *_sections_of(_parts_of_causes(answer)), *_residuals(answer)]
 
 
-def _shown(parts: Mapping[str, tuple[str, Sequence[Any]]]) -> list[Section]:
+def _sections_of(parts: Mapping[str, tuple[str, Sequence[Any]]]) -> list[Section]:
     """A section with a title, a text and figures of each part that has a figure."""
     figures = {title: [figure for figure in made if figure is not None] for title, (_, made) in parts.items()}
     return [Section(title, paragraph(text), figures[title]) for title, (text, _) in parts.items() if figures[title]]
 
 
-def _explained(answer: Diagnosis) -> dict[str, tuple[str, Sequence[Any]]]:
+def _parts_of_causes(answer: Diagnosis) -> dict[str, tuple[str, Sequence[Any]]]:
     return {
         "The causes one by one": (
             "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual minus "
