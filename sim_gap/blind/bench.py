@@ -82,7 +82,7 @@ def make_cases(
     effects: str = "",
     positions: bool = False,
 ) -> Iterator[int]:
-    """Make the cases of `run_bench`, each in another process, so that this one knows no label; yields their number."""
+    """Make the cases of `run_bench` and yield their number; what knows a label runs in other processes."""
     low, _, high = effects.partition("-")
     if effects and not (low.isdecimal() and high.isdecimal() and 1 <= int(low) <= int(high) <= MOST_EFFECTS):
         raise BadInput(f"--effects {effects}: expected LOW-HIGH from 1 to {MOST_EFFECTS}, such as 5-8")
@@ -98,7 +98,7 @@ def make_cases(
     yield 0
     for done, _ in enumerate(_run_apart(jobs, workers), start=1):
         yield done
-    write_withheld(labels, positions)
+    list(_run_apart([partial(write_withheld, labels, positions)], 1))
 
 
 def tasks(out: Path) -> list[list[str]]:
