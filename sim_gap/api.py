@@ -52,40 +52,27 @@ def diagnose(
 
     Raises BadInput if the recordings cannot be used with the model.
     """
-    stated = parse_corrections(
-        columns=_texts(columns),
-        sign=_texts(sign),
-        units=_texts(units),
-        zero=_texts(zero),
-        clock=_texts(clock),
-        effort_is=effort_is,
-        joints=",".join(joints),
-        topic=topic,
-    )
+    given = {"columns": columns, "sign": sign, "units": units, "zero": zero, "clock": clock}
+    words = {
+        option: [f"{column}={value}" for column, value in each.items()] if isinstance(each, Mapping) else each
+        for option, each in given.items()
+    }
+    stated = parse_corrections(header="", **words, effort_is=effort_is, joints=",".join(joints), topic=topic)
     trained, judged = (_recordings(*each, stated.of_reading()) for each in (("train", train), ("heldout", heldout)))
     labels = [label for label, _ in (*trained, *judged)]
     recordings = [recording for _, recording in trained], [recording for _, recording in judged]
     return diagnosis.diagnose(model, *recordings, labels=labels, stated=stated, base=base, tip=tip)
 
 
-def _texts(stated: Stated) -> Sequence[str]:
-    """In the words of the command."""
-    return [f"{column}={value}" for column, value in stated.items()] if isinstance(stated, Mapping) else stated
-
-
 def _recordings(
     role: str, given: RecordingLike | Sequence[RecordingLike], reading: Corrections
 ) -> list[tuple[str, Recording]]:
     """(Label, recording) of each."""
-    items = [given] if isinstance(given, Recording | str | Path) else given
-    if not isinstance(items, Sequence):
-        raise BadInput(f"diagnose: {role}: expected recordings or their paths, not {type(given).__name__}")
-    found = []
-    for number, each in enumerate(items, start=1):
-        if isinstance(each, Recording):
-            found.append((f"{role} {number}", each))
-        elif isinstance(each, str | Path):
-            found.append((str(each), load_recording(each, reading)))
-        else:
+    items = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    for each in items:
+        if not isinstance(each, Recording | str | Path):
             raise BadInput(f"diagnose: {role}: expected recordings or their paths, not {type(each).__name__}")
-    return found
+    return [
+        (f"{role} {k}", each) if isinstance(each, Recording) else (str(each), load_recording(each, reading))
+        for k, each in enumerate(items, start=1)
+    ]

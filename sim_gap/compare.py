@@ -29,8 +29,6 @@ from sim_gap.residuals.residual_set import residual_sets
 
 RESAMPLED = 2000
 """Samples of a bootstrap over windows (Efron and Tibshirani 1993: a thousand and more for the ends of an interval)."""
-ALIKE = 0.01
-"""Relative difference of two gaps that is none to a user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +49,8 @@ class ModelGap:
 
     @property
     def alike(self) -> bool:
-        """Whether these recordings do not tell it from the best."""
-        return self.over_best[0] <= 1.0 + ALIKE
+        """Whether these recordings do not tell it from the best by more than 1 %."""
+        return self.over_best[0] <= 1.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,17 +172,10 @@ def _ranked(
     total, overall = np.sqrt((each**2).mean(1)), np.sqrt((whole**2).mean(1))
     best = int(np.argmin(overall))
     ratio = total / np.maximum(total[best], 1e-300)
-    ends = [np.quantile(x, (share, 1.0 - share), axis=-1) for x in (each, total, ratio)]
-    made = [
-        ModelGap(
-            model,
-            whole[m],
-            ends[0][0, m],
-            ends[0][1, m],
-            (float(overall[m]), float(ends[1][0, m]), float(ends[1][1, m])),
-            free[m] if free else None,
-            (float(ends[2][0, m]), float(ends[2][1, m])),
-        )
-        for m, model in enumerate(models)
-    ]
+    made = []
+    for m, model in enumerate(models):
+        low, high = np.quantile(each[m], (share, 1.0 - share), axis=-1)
+        (low_all, high_all), over = (np.quantile(x[m], (share, 1.0 - share)).tolist() for x in (total, ratio))
+        whole_gap = float(overall[m]), low_all, high_all
+        made.append(ModelGap(model, whole[m], low, high, whole_gap, free[m] if free else None, tuple(over)))
     return ModelComparison(unit, names, windows, tuple(sorted(made, key=lambda each: each.overall[0])))

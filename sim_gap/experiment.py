@@ -6,7 +6,7 @@ Pieces move single joints and all together. A file of planned motion is CSV with
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,49 +14,79 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.content.atomic_file import open_whole, writing
-from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.extras import require_extra
 from armlink.link.types import Setpoints
 from armlink.loop.driver import ArmDriver
-from armlink.recording.csv_text import layout_of, read_numbers, write_numbers
+from armlink.recording.csv_text import load_columns, write_numbers
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.trajectory import trajectory
+from calib.motion.trajectory import WorkMotion, trajectory, way_and_rest
 from gcomp.arrays import Array
 
-MARGIN = 0.12
-"""Distance from each stop, as a share of the range."""
 SPEEDS = (0.03, 0.1, 0.3, 0.6)
 """Constant speeds, as shares of a joint's max_velocity."""
-PACE = 0.5
-"""Speed on the way to a pose, as a share of max_velocity."""
-ACCELERATION = 1.0
-"""Largest acceleration [rad/s²], for drives with little torque in excess of gravity."""
+MOVES = WorkMotion(speed_share=0.5, acceleration=1.0, rest=1.0)
+"""Moves between poses, for drives with little torque in excess of gravity."""
 LONGEST = 25.0
 """Longest time for one pass through the range [s]: at creeping speed only a part of it is covered."""
-REST_S = 1.0
-"""Rest between moves [s]."""
-SPEED_TOLERANCE = 1.05
-"""Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""
 TONES, BAND, FADE_S = 4, (0.08, 0.6), 2.0
 """Number of sines per joint in the motion of all joints, their frequency band [Hz], and time of their rise and fall
 [s]."""
 
 
-@dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """Position targets of an arm, one per cycle."""
+    """Position targets of an arm, one per cycle, from the middle of all ranges on, 12 % of each range from its ends."""
 
-    names: tuple[str, ...]
-    rate: float
-    target: Array
-    """(K, n) [rad]."""
-    pieces: tuple[str, ...]
-    """Description of each part."""
+    def __init__(self, arm: ArmFile) -> None:
+        section, described = arm.require_link(), gcomp_arm(arm)
+        self.names, self.rate = described.names, float(section.rate)
+        room = 0.12 * (described.upper - described.lower)
+        self.low, self.high = described.lower + room, described.upper - room
+        self.fastest = np.array([joint.max_velocity for joint in section.joints])
+        self.here = (self.low + self.high) / 2
+        self.rows: list[Array] = [self.here[None]]
+        self.pieces: list[str] = []
+        """Description of each part."""
+
+    @property
+    def target(self) -> Array:
+        """(K, n) [rad]."""
+        return np.concatenate(self.rows)
 
     @property
     def seconds(self) -> float:
         return len(self.target) / self.rate
+
+    def go(self, goal: Array, motion: WorkMotion = MOVES) -> None:
+        """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
+        self.rows.append(way_and_rest(self.here, goal, self.fastest, 1 / self.rate, motion))
+        self.here = goal
+
+    def turn(self, joint: int, pose: Array) -> None:
+        """Move one joint through its range at each constant speed, both directions, the others at `pose` (n,) [rad]."""
+        for share in SPEEDS:
+            middle, half = (self.low[joint] + self.high[joint]) / 2, (self.high[joint] - self.low[joint]) / 2
+            half = min(half, share * self.fastest[joint] * LONGEST / 2)
+            for end in (middle - half, middle + half, middle - half):
+                goal = pose.copy()
+                goal[joint] = end
+                there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
+                self.go(goal, replace(MOVES, speed_share=share) if there else MOVES)
+        self.pieces.append(
+            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, the other joints at "
+            f"{np.round(pose, 2)}"
+        )
+
+    def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
+        """Move the joints together, each by its own sum of sines about the middle of its range."""
+        self.go((self.low + self.high) / 2)
+        reach, speed = (x[joints] for x in (0.45 * (self.high - self.low), MOVES.speed_share * self.fastest))
+        t = np.arange(round(seconds * self.rate)) / self.rate
+        rows = np.repeat(self.here[None], len(t), axis=0)
+        rows[:, joints] += multisine(t, reach, speed, BAND, random.random((len(joints), 2, TONES)))
+        self.rows.append(rows)
+        self.here = rows[-1]
+        self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
 
 
 def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> PlannedMotion:
@@ -66,8 +96,8 @@ def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: 
     from load-dependent effects and backlash, and the sines of all joints separate inertia, rotor and lag. Raises
     BadInput for a joint that the arm does not have.
     """
-    shape = _Shape(arm)
-    names = list(shape.names)
+    motion = PlannedMotion(arm)
+    names = list(motion.names)
     for joint in joints:
         if joint not in names:
             raise BadInput(f"there is no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
@@ -76,63 +106,17 @@ def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: 
     for pose in range(poses):
         share = random.uniform(0.15, 0.85, len(names)) if pose else np.full(len(names), 0.5)
         for number in chosen:
-            shape.turn(number, shape.low + share * (shape.high - shape.low))
-    shape.sines(chosen, random)
-    return PlannedMotion(shape.names, shape.rate, np.concatenate(shape.rows), tuple(shape.pieces))
-
-
-class _Shape:
-    """The motion under construction; it starts in the middle of all ranges."""
-
-    def __init__(self, arm: ArmFile) -> None:
-        section, described = arm.require_link(), gcomp_arm(arm)
-        self.names, self.rate = described.names, float(section.rate)
-        room = MARGIN * (described.upper - described.lower)
-        self.low, self.high = described.lower + room, described.upper - room
-        self.fastest = np.array([joint.max_velocity for joint in section.joints])
-        self.here = (self.low + self.high) / 2
-        self.rows: list[Array] = [self.here[None]]
-        self.pieces: list[str] = []
-
-    def go(self, goal: Array, speed: Array) -> None:
-        """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
-        way = trajectory(self.here, goal, speed, np.full(len(goal), ACCELERATION), 1 / self.rate)
-        self.rows += [way, np.repeat(goal[None], round(REST_S * self.rate), axis=0)]
-        self.here = goal
-
-    def turn(self, joint: int, pose: Array) -> None:
-        """Move one joint through its range at each constant speed, both directions, the others at `pose` (n,) [rad]."""
-        for share in SPEEDS:
-            speed = share * self.fastest[joint]
-            middle, half = (self.low[joint] + self.high[joint]) / 2, (self.high[joint] - self.low[joint]) / 2
-            half = min(half, speed * LONGEST / 2)
-            for end in (middle - half, middle + half, middle - half):
-                goal = pose.copy()
-                goal[joint] = end
-                there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
-                self.go(goal, np.full(len(goal), speed) if there else PACE * self.fastest)
-        self.pieces.append(
-            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, the other joints at "
-            f"{np.round(pose, 2)}"
-        )
-
-    def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
-        """Move the joints together, each by its own sum of sines about the middle of its range."""
-        self.go((self.low + self.high) / 2, PACE * self.fastest)
-        reach, speed = (x[joints] for x in (0.45 * (self.high - self.low), PACE * self.fastest))
-        t = np.arange(round(seconds * self.rate)) / self.rate
-        rows = np.repeat(self.here[None], len(t), axis=0)
-        rows[:, joints] += multisine(t, reach, speed, BAND, random.random((len(joints), 2, TONES)))
-        self.rows.append(rows)
-        self.here = rows[-1]
-        self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
+            motion.turn(number, motion.low + share * (motion.high - motion.low))
+    motion.sines(chosen, random)
+    return motion
 
 
 def multisine(t: Array, reach: Array, speed: Array, band: tuple[float, float], draw: Array) -> Array:
     """Way from a middle (K, n) [rad], from rest to rest at even times: of each joint sines with frequencies of a band
-    [Hz], within its reach [rad] and speed [rad/s], (n,) each, and ACCELERATION; by random numbers (n, 2, sines)."""
+    [Hz], within its reach [rad] and speed [rad/s], (n,), and MOVES' acceleration; by random numbers (n, 2, sines).
+    """
     omega = 2 * np.pi * (band[0] + (band[1] - band[0]) * draw[:, 0])
-    size = np.minimum(np.minimum(reach[:, None], speed[:, None] / omega), ACCELERATION / omega**2) / draw.shape[2]
+    size = np.minimum(np.minimum(reach[:, None], speed[:, None] / omega), MOVES.acceleration / omega**2) / draw.shape[2]
     fade = np.clip(np.minimum(t, t[-1] + t[1] - t) / FADE_S, 0.0, 1.0)
     fade = fade * fade * (3 - 2 * fade)
     return np.asarray(fade[:, None] * (size * np.sin(t[:, None, None] * omega + 2 * np.pi * draw[:, 1])).sum(axis=2))
@@ -157,8 +141,9 @@ def save_motion(motion: PlannedMotion, path: Path) -> None:
     """Write `.csv`; raises BadInput if it cannot be written."""
     if path.suffix != ".csv":
         raise BadInput(f"{path}: a motion is written as .csv")
-    columns = {"t": np.arange(len(motion.target)) / motion.rate}
-    columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
+    target = motion.target
+    columns = {"t": np.arange(len(target)) / motion.rate}
+    columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(target.T)}
     with writing(path), open_whole(path) as stream:
         write_numbers(stream, columns)
 
@@ -169,9 +154,11 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
     Raises BadInput if the motion does not fit the arm: columns, missing values, time, range, speed.
     """
     described, section = gcomp_arm(arm), arm.require_link()
-    t, target = _columns(path, [f"q_cmd_{i + 1}" for i in range(described.n)])
+    t, *target = load_columns(path, ["t", *(f"q_cmd_{i + 1}" for i in range(described.n))]).T
+    if len(t) < 2 or not (np.diff(t) > 0).all():
+        raise BadInput(f"{path}: column t does not increase from row to row: expected seconds, at least two rows")
     even: Array = np.arange(t[0], t[-1], 1.0 / section.rate)
-    rows: Array = np.column_stack([np.interp(even, t, column) for column in target.T])
+    rows: Array = np.column_stack([np.interp(even, t, column) for column in target])
     for column, name, low, high, limits in zip(
         rows.T, described.names, described.lower, described.upper, section.joints, strict=True
     ):
@@ -181,34 +168,12 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
                 f"{high:.3f} rad: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
         fastest = float(np.abs(np.diff(column)).max()) * section.rate
-        if fastest > SPEED_TOLERANCE * limits.max_velocity:
+        if fastest > 1.05 * limits.max_velocity:  # a file's numbers are rounded
             raise BadInput(
                 f"{path}: {name} turns at {fastest:.3f} rad/s, but its max_velocity is {limits.max_velocity:.3f} "
                 f"rad/s: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
     return rows
-
-
-def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
-    """Times (K,) and columns (K, n), all finite, times increasing."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise BadInput(f"{path}: not a readable CSV file: {error.strerror}") from None
-    with memory_budget(path):
-        layout = layout_of(content, str(path))
-        missing = [name for name in ("t", *names) if name not in layout.header]
-        if missing:
-            raise BadInput(f"{path}: column {', '.join(missing)} is missing: expected t and q_cmd_1 to {names[-1]}")
-        places = {name: layout.header.index(name) for name in ("t", *names)}
-        values = np.column_stack(list(read_numbers(content, layout, places, str(path)).values()))
-    bad = np.argwhere(~np.isfinite(values))
-    if len(bad):
-        raise BadInput(f"{path}: row {bad[0][0] + 1}: {('t', *names)[bad[0][1]]} has no value")
-    t = values[:, 0]
-    if len(t) < 2 or not (np.diff(t) > 0).all():
-        raise BadInput(f"{path}: column t does not increase from row to row: expected seconds, at least two rows")
-    return t, values[:, 1:]
 
 
 def collect(
@@ -223,8 +188,8 @@ def collect(
     from armlink.recording.mcap import RecordingWriter
 
     section = link.arm.require_link()
-    speed = PACE * np.array([joint.max_velocity for joint in section.joints])
-    way = trajectory(link.position_sent, target[0], speed, np.full(link.n, ACCELERATION), link.period)
+    speed = MOVES.speed_share * np.array([joint.max_velocity for joint in section.joints])
+    way = trajectory(link.position_sent, target[0], speed, np.full(link.n, MOVES.acceleration), link.period)
     for _ in link.play(Setpoints.follow(way)):
         pass
     start: float | None = None

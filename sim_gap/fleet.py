@@ -18,10 +18,10 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from armlink.content.atomic_file import writing
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
+from armlink.recording.files import SUFFIXES, load_recording
+from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import parse_known_gains
-
-CONNECT_SECONDS = 10.0
-"""Longest wait for a scheduler to answer [s]."""
+from sim_gap.trends import watched_parameters
 
 
 def open_to_all(scheduler: str | None) -> str:
@@ -48,7 +48,7 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=CONNECT_SECONDS)
+            client = Client(scheduler, timeout=10.0)
         except (OSError, ValueError) as error:
             raise BusFault(
                 f"there is no dask scheduler at {scheduler} ({error}): start a scheduler, or omit --scheduler"
@@ -69,7 +69,6 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
 
 
 MODELS = ("sim.xml", "sim.urdf", "sim.yaml")
-SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
 @dataclass(frozen=True)
@@ -130,13 +129,11 @@ class CaseOptions:
         return {name: value for name, value in every.items() if value}
 
 
-def diagnose_case(case: Case, options: CaseOptions | None = None) -> dict[str, Any]:
-    """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
-    from armlink.recording.files import load_recording
-    from sim_gap.attribution.diagnose import diagnose
-    from sim_gap.trends import watched_parameters
+NO_OPTIONS = CaseOptions()
 
-    options = options or CaseOptions()
+
+def diagnose_case(case: Case, options: CaseOptions = NO_OPTIONS) -> dict[str, Any]:
+    """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
     paths = [*case.train, *case.heldout]
     try:
         recordings = [load_recording(path, options.stated.of_reading()) for path in paths]
@@ -157,7 +154,7 @@ def diagnose_case(case: Case, options: CaseOptions | None = None) -> dict[str, A
 
 
 def diagnose_fleet(
-    cases: list[Case], client: Any, options: CaseOptions | None = None
+    cases: list[Case], client: Any, options: CaseOptions = NO_OPTIONS
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """(Case name, result) as they arrive from the cluster of a `distributed.Client`; each case once."""
     from distributed import as_completed
@@ -218,10 +215,10 @@ class Answers:
     `found` has those that were made with the same options: others are of data that were read in another way.
     """
 
-    def __init__(self, path: Path, options: CaseOptions | None = None) -> None:
+    def __init__(self, path: Path, options: CaseOptions = NO_OPTIONS) -> None:
         """Read the existing lines. Raises BadInput if the file has other contents or cannot be written."""
         self.path = path
-        self.options = json.loads(json.dumps((options or CaseOptions()).to_json()))
+        self.options = json.loads(json.dumps(options.to_json()))
         self.found: dict[str, dict[str, Any]] = {}
         other: set[str] = set()
         with writing(path), path.open("a+b") as stream:

@@ -13,11 +13,12 @@ is judged by the scatter from one diagnosis to the next and not by the intervals
 import re
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import Internals
@@ -28,34 +29,33 @@ from sim_gap.search.term import Term
 
 WATCHED = ("friction.coulomb", "friction.viscous", "torque.gain", "actuator.gain", "transmission.backlash")
 """Effects that are followed. A ripple, whose number of cycles has to be found first, is followed among the causes."""
-RIPPLE = "transmission.ripple"
-MOVES = 0.05
-"""Share of the samples in motion from which a joint's parameters are estimated."""
 
 
 def watched_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Watched parameters with 95 % intervals, of each joint that moves; none without a torque channel."""
+    """Watched parameters with 95 % intervals, of each joint that moves in 5 % of the samples; none without a torque
+    channel."""
     made = diagnosis.internals
     if not isinstance(made, Internals):
         return []
-    fit, layout = made.fitted, made.train.layout
-    moving = sum(s.moving.mean(0) for s in made.train.signals) / len(made.train.signals)
-    main = {cause.effect for cause in diagnosis.causes} | {RIPPLE}
-    kept = [term for term in fit.terms if term.effect in main and term.effect not in WATCHED]
-    followed = [
-        Term(effect, joint)
-        for effect in WATCHED
-        for joint in effects()[effect].signature.places(layout)
-        if moving[joint] > MOVES
+    signals, places = made.train.signals, {name: effects()[name].signature.places for name in WATCHED}
+    moving = sum(each.moving.mean(0) for each in signals) / len(signals)
+    main = {"transmission.ripple", *(cause.effect for cause in diagnosis.causes)}.difference(WATCHED)
+    kept = [term for term in made.fitted.terms if term.effect in main]
+    followed = [Term(name, j) for name in WATCHED for j in places[name](made.train.layout) if moving[j] > 0.05]
+    whole = EffectEstimate(made.fitted.store, [*kept, *followed])
+    return [
+        {
+            "effect": term.effect,
+            "joint": diagnosis.names[term.place],
+            "parameter": name,
+            "value": one.value,
+            "ci95": [one.low, one.high],
+            "unit": one.unit,
+        }
+        for term in whole.terms
+        if term.effect in WATCHED
+        for name, one in whole.parameters(term).items()
     ]
-    whole = EffectEstimate(fit.store, [*kept, *followed])
-    out = []
-    for term in whole.terms:
-        if term.effect in WATCHED:
-            for name, one in whole.parameters(term).items():
-                where = {"effect": term.effect, "joint": diagnosis.names[term.place], "parameter": name}
-                out.append({**where, "value": one.value, "ci95": [one.low, one.high], "unit": one.unit})
-    return out
 
 
 FIRST, LAST = 7, 5
@@ -65,14 +65,10 @@ NEEDED = FIRST + LAST + 1
 SURE = 5.0
 """Multiple of the difference's standard deviation from which a parameter has changed, in two diagnoses running."""
 LEAST = {"friction.coulomb": 0.05, "friction.viscous": 0.05, "torque.gain": 0.005, "actuator.gain": 0.005}
-LEAST_OTHER = 0.01
-"""Least change by effect, as a share of the reference: friction varies with temperature, a gain does not."""
-LEAST_SEEN = 0.05
-"""Least change of what is watched, as a share of its interval's half width."""
+"""Least change by effect, as a share of the reference, 1 % of others: friction varies with temperature, a gain does
+not."""
 NO_WEAR = frozenset({"cycles", "phase"})
 """Parameters that say where an effect is, and not how large."""
-CLEAR = 3.0
-"""Multiple of the usual interval above which a watched value is left out: the joint hardly moved that day."""
 POOLED = 6
 """Weight of the fleet's scatter against an arm's own, as a number of diagnoses."""
 ARMS, DIFFERS = 5, 0.25
@@ -184,28 +180,21 @@ def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
     for (effect, joint, parameter), arms in latest.items():
         values = np.array([value for value, _ in arms.values()])
         middle = float(np.median(values))
-        spread = 1.4826 * float(np.median(np.abs(values - middle)))
+        spread = float(median_abs_deviation(values, scale="normal"))
         for arm, (value, unit) in arms.items() if len(arms) >= ARMS else ():
             if abs(value - middle) > max(SURE * spread, DIFFERS * abs(middle)):
                 out.append(Outlier(arm, effect, joint, parameter, unit, value, middle))
     return out
 
 
-def rows(found: Sequence[Trend | Outlier]) -> list[dict[str, Any]]:
-    return [asdict(one) for one in found]
-
-
 def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dict[Key, _Series]:
     by_arm: dict[str, list[tuple[datetime, Mapping[str, Any]]]] = defaultdict(list)
-    undated = {
-        case.split("/")[0] for case, answer in answers.items() if "error" not in answer and date_of(case) is None
-    }
     for case, answer in sorted(answers.items()):
         if "error" not in answer:
             by_arm[case.split("/")[0]].append((date_of(case) or UNDATED, answer))
     out: dict[Key, _Series] = {}
     for arm, cases in by_arm.items():
-        if dated and (arm in undated or len(cases) < NEEDED):
+        if dated and (len(cases) < NEEDED or any(date is UNDATED for date, _ in cases)):
             continue
         cases.sort(key=lambda pair: pair[0])
         watched = [(date, _watched_values(answer)) for date, answer in cases if dated and answer.get("watched")]
@@ -226,24 +215,18 @@ def _of_arm(arm: str, answers: Sequence[tuple[datetime, Values]]) -> dict[Key, _
             if (arm, *which) not in out:
                 out[arm, *which] = _Series(unit, dates, *np.full((2, len(dates)), np.nan))
             out[arm, *which].values[k], out[arm, *which].interval[k] = value, half
-    return {key: _without_unclear(one) for key, one in out.items()}
-
-
-def _without_unclear(one: _Series) -> _Series:
-    if one.watched:
-        one.values[one.interval > CLEAR * np.nanmedian(one.interval)] = np.nan
-    return one
+    for one in out.values():
+        if one.watched:  # a joint that hardly moved that day has three times its usual interval
+            one.values[one.interval > 3.0 * np.nanmedian(one.interval)] = np.nan
+    return out
 
 
 def _watched_values(answer: Mapping[str, Any]) -> Values:
-    return {
-        (one["effect"], one["joint"], one["parameter"]): (
-            float(one["value"]),
-            0.5 * (float(one["ci95"][1]) - float(one["ci95"][0])),
-            one["unit"],
-        )
-        for one in answer["watched"]
-    }
+    found = {}
+    for one in answer["watched"]:
+        low, high = map(float, one["ci95"])
+        found[one["effect"], one["joint"], one["parameter"]] = float(one["value"]), 0.5 * (high - low), one["unit"]
+    return found
 
 
 def _values(answer: Mapping[str, Any], leave: Collection[str]) -> Values:
@@ -265,8 +248,7 @@ def _scatter(one: _Series) -> tuple[float, int, float]:
     steps = np.diff(there)
     if len(steps) < 2:
         return 0.0, 0, size
-    own = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2.0)
-    return float(own), len(steps), size
+    return float(median_abs_deviation(steps, scale="normal") / np.sqrt(2.0)), len(steps), size
 
 
 def _window(one: _Series, part: slice) -> float:
@@ -280,8 +262,8 @@ def _window(one: _Series, part: slice) -> float:
 
 def _trend(key: Key, one: _Series, noise: float) -> Trend | None:
     start = _window(one, slice(FIRST))
-    seen = LEAST_SEEN * float(np.nanmedian(one.interval)) if one.watched else 0.0
-    share = LEAST.get(key[1], LEAST_OTHER)
+    seen = 0.05 * float(np.nanmedian(one.interval)) if one.watched else 0.0  # in half widths of its interval
+    share = LEAST.get(key[1], 0.01)
     least = max(SURE * noise * float(np.sqrt(1.0 / FIRST + 1.0 / LAST)), share * abs(start), seen, 1e-12)
     hidden = HIDDEN * float(np.nanmin(np.abs(one.values)))
     running = 0

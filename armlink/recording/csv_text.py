@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -202,29 +202,26 @@ def no_time(cell: object, row: int, source: str) -> BadInput:
     )
 
 
-def load_poses(path: Path, n: int) -> Array:
-    """Poses (K, n) [rad] from the columns q_1 … q_n of a CSV file with a header row; other columns are left alone.
+def load_columns(path: Path, wanted: Sequence[str]) -> Array:
+    """Columns of a CSV file with a header row, finite numbers alone (K, columns); other columns are left alone.
 
     Raises BadInput naming the file and the column, or the row.
     """
     if not path.is_file():
-        raise BadInput(f"there is no file {path}: give a CSV file with the columns q_1 … q_{n} [rad]")
-    wanted = [f"q_{number}" for number in range(1, n + 1)]
+        raise BadInput(f"there is no file {path}: give a CSV file with the columns {', '.join(wanted)}")
     with memory_budget(path):
         content = path.read_bytes()
         layout = layout_of(content, str(path))
         missing = next((name for name in wanted if name not in layout.header), None)
         if missing is not None:
-            raise BadInput(
-                f"{path}: column {missing} is missing: expected one column for each joint, q_1 … q_{n} [rad]"
-            )
-        columns = {name: layout.header.index(name) for name in wanted}
-        poses = np.column_stack(list(read_numbers(content, layout, columns, str(path)).values()))
-    if not len(poses):
-        raise BadInput(f"{path}: there is no pose below the header row")
-    for row, joint in np.argwhere(~np.isfinite(poses)):
-        raise BadInput(f"{path}: row {row + 1}: {wanted[joint]} is {poses[row, joint]}, expected an angle in rad")
-    return poses
+            raise BadInput(f"{path}: column {missing} is missing: expected the columns {', '.join(wanted)}")
+        places = {name: layout.header.index(name) for name in wanted}
+        values = np.column_stack(list(read_numbers(content, layout, places, str(path)).values()))
+    if not len(values):
+        raise BadInput(f"{path}: there is no row of values below the header row")
+    for row, column in np.argwhere(~np.isfinite(values)):
+        raise BadInput(f"{path}: row {row + 1}: {wanted[column]} is {values[row, column]}, expected a number")
+    return values
 
 
 def write_numbers(stream: IO[bytes] | io.BufferedIOBase, columns: Mapping[str, Array]) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from referee import mujoco_plant, seal
 from sim_gap.blind.cases import make_case, write_csv
 from sim_gap.blind.effects import EFFECTS, controller
-from sim_gap.blind.judge import BESIDE_POINT
 from sim_gap.blind.recipe import CaseRecipe
+from sim_gap.blind.score import BESIDE_POINT
 
 TORQUE_S, POSITION_S = (60.0, 20.0), (36.0, 18.0)
 """Seconds of training and held-out recordings of the first plant."""

@@ -7,11 +7,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from armlink.arm_file import read_yaml
 from armlink.errors import ArmlinkError
 from armlink.recording.recording import Recording
 from referee.seal import seal
 from sim_gap.blind.cases import write_csv
-from sim_gap.blind.real_recordings import KNOWN, read_cases, recordings_of
+from sim_gap.blind.real_recordings import KNOWN, recordings_of
 from sim_gap.model.load import load_model
 
 FIELDS = {
@@ -32,7 +33,7 @@ def draw_real(folder: Path, out: Path, key: bytes, cpu_seconds: float) -> dict[s
     """Write the cases whose files are there; names and hashes of the sealed parts. Arms whose
     model is no MJCF that is complete by itself are left out."""
     hashes = {}
-    for known in read_cases(KNOWN):
+    for known in read_yaml(KNOWN):
         name = f"real_{known['case']}"
         try:
             train, heldout, _ = recordings_of(folder, known)

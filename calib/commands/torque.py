@@ -34,11 +34,11 @@ def torque(
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
-    from armlink.recording.csv_text import load_poses
+    from armlink.recording.csv_text import load_columns
     from gcomp.gravity.torque import gravity_torque
 
     described, beta, source = _model(arm, base, tip, record, tool, store)
-    poses = load_poses(q, described.n)
+    poses = load_columns(q, [f"q_{joint + 1}" for joint in range(described.n)])
     answer = gravity_torque(described, beta, poses)
     table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
     for number, row in enumerate(answer, start=1):

@@ -37,20 +37,20 @@ def inertial_of_pseudo(pseudo: Array) -> Array:
     return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[SIX]])
 
 
-def _steiner(centre: Array) -> Array:
+def steiner(centre: Array) -> Array:
     """Inertia of a unit mass at a point (3,), about the origin (3, 3)."""
     return np.asarray(centre @ centre * np.eye(3) - np.outer(centre, centre))
 
 
 def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
     """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
-    return np.concatenate([[mass], mass * centre, (inertia + mass * _steiner(centre))[SIX]])
+    return np.concatenate([[mass], mass * centre, (inertia + mass * steiner(centre))[SIX]])
 
 
 def point_mass(mass: float, moment: Array) -> Array:
     """Ten parameters of a point mass (negative if it is taken away) from its mass and first moment."""
     centre = moment / mass if abs(mass) > LIGHT_KG else np.zeros(3)
-    return np.concatenate([[mass], moment, mass * _steiner(centre)[SIX]])
+    return np.concatenate([[mass], moment, mass * steiner(centre)[SIX]])
 
 
 def point_slopes(mass: float, moment: Array) -> Array:
@@ -58,7 +58,7 @@ def point_slopes(mass: float, moment: Array) -> Array:
     out = np.vstack([np.eye(4), np.zeros((6, 4))])
     if abs(mass) > LIGHT_KG:
         centre = moment / mass
-        out[4:, 0], out[4:, 1:] = -_steiner(centre)[SIX], moment_to_inertia(centre)
+        out[4:, 0], out[4:, 1:] = -steiner(centre)[SIX], moment_to_inertia(centre)
     return out
 
 
@@ -119,7 +119,7 @@ def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
     """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
     mass = max(float(inertial[0]), LIGHT_KG)
     centre = inertial[1:4] / mass
-    return mass, centre, symmetric(inertial[4:]) - mass * _steiner(centre)
+    return mass, centre, symmetric(inertial[4:]) - mass * steiner(centre)
 
 
 def write_bodies(spec: Any, nominal: Any, model: Any) -> None:

@@ -15,7 +15,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
 from gcomp.arm.inertials import body_parameters
 from gcomp.arm.mass_moments import base_parameters
-from gcomp.arm.model_file import NotXml, parse_xml, upwards
+from gcomp.arm.model_file import NotXml, links_of_bodies, parse_xml, upwards
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
 
@@ -241,7 +241,7 @@ def _place(
     limited = np.array([bool(model.jnt_limited[joint]) for joint in chain])
     limits = np.where(limited[:, None], model.jnt_range[chain], [-np.inf, np.inf])
     reference = np.array([model.qpos0[model.jnt_qposadr[joint]] for joint in chain])
-    link_of = _links(model, chain)
+    link_of = {body: link for body, link in enumerate(links_of_bodies(model, chain)) if link >= 0}
     own = {"its gravity": model.opt.gravity} if gravity is None else {}
     for joint, at_rest in zip(chain, reference, strict=True):
         own[f"joint {model.joint(joint).name}"] = [at_rest, *data.xaxis[joint], *data.xanchor[joint]]
@@ -274,17 +274,6 @@ def _refuse_what_is_no_number(values: Mapping[str, ArrayLike], path: Path) -> No
     for of, numbers in values.items():
         if not np.isfinite(numbers).all():
             raise BadModel(f"{path}: {of}: NaN or infinity where a finite number is expected")
-
-
-def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
-    """Index of the link that each body belongs to, by body id; bodies of the base are left out."""
-    link_of: dict[int, int] = {}
-    last_joint = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(chain)}
-    for body in range(1, model.nbody):  # parents come before children
-        link = last_joint.get(body, link_of.get(int(model.body_parentid[body])))
-        if link is not None:
-            link_of[body] = link
-    return link_of
 
 
 def body_in_bar_frame(placed: PlacedChain, link: int, body: int) -> tuple[Array, Array]:

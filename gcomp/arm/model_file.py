@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 from xml.parsers import expat
 
@@ -44,6 +44,12 @@ def upwards(model: "mujoco.MjModel", body: int) -> list[int]:
     while found[-1]:
         found.append(int(model.body_parentid[found[-1]]))
     return found
+
+
+def links_of_bodies(model: "mujoco.MjModel", joints: Sequence[int]) -> list[int]:
+    """The link, of those that the joints move, that each body belongs to; −1 for one that none carries."""
+    moved = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
+    return [next((moved[up] for up in upwards(model, body) if up in moved), -1) for body in range(model.nbody)]
 
 
 def carried_bodies(model: "mujoco.MjModel", bodies: Iterable[int]) -> list[int]:

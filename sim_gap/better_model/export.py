@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from armlink.content.atomic_file import write_whole, writing
 from calib.arm.model_files import URDF, urdf_of, xml_comment
 from gcomp.arm.inertials import body_parameters, fixed_body_parameters, pseudo_inertia, set_body, write_bodies
-from gcomp.arm.model_file import linear_part
+from gcomp.arm.model_file import linear_part, links_of_bodies
 from gcomp.arm.rigid_body import CREEP
 from gcomp.arrays import Array
 from sim_gap.better_model import forward_effects
@@ -20,7 +21,7 @@ from sim_gap.better_model.forward_effects import STEP_S, JointEffect
 from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.effects.torque import GRADUAL, is_gradual
-from sim_gap.model.load import SimModel, links_of_bodies, named_spec, urdf_behind
+from sim_gap.model.load import SimModel, named_spec, urdf_behind
 from sim_gap.search.column_store import inertial_change
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
@@ -52,8 +53,6 @@ HELD = {
 """Effects that a MuJoCo model can hold, and the element that holds them."""
 OF_READING = ("position.gain", "position.eccentricity")
 """Errors of a reading that a MuJoCo model cannot hold; an offset beside them is left to the module, too."""
-LEFT_KG = 1e-9
-"""Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
 
 
 @dataclass(frozen=True)
@@ -80,44 +79,45 @@ def with_effects(
     `mount` about the last joint's axis [rad].
     """
     chosen = estimate.terms if terms is None else tuple(terms)
-    model = _base(sim, estimate, chosen)
+    model = copy.copy(sim.mujoco_model)
+    if sim.path is not None and any(term.effect == "transmission.coupling" for term in chosen):
+        spec = named_spec(sim)
+        add_motors(spec, sim, estimate, chosen)
+        model = spec.compile()
     bent = {term.place for term in chosen if term.effect in OF_READING}
     left_out = {
         *(term for term in chosen if term.effect == "transmission.coupling" and sim.path is None),
         *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
     }
     held = tuple(term for term in chosen if term.effect in HELD and term.present(number) and term not in left_out)
-    turn = mount_matrix(sim.arm.axis[-1], mount)
-    links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
-    changed = _set_links(model, sim, links, number)
+    turn, inertial = mount_matrix(sim.arm.axis[-1], mount), sim.arm.inertial.copy()
+    for term in held:
+        body = term.effect == "link.payload"
+        change = inertial_change(term, turn @ estimate.of(term) if body else estimate.of(term), inertial, number)
+        if change is not None:
+            inertial[sim.n - 1 if body else term.place] += change
+    added = inertial - sim.arm.inertial
+    moved = np.flatnonzero(np.any(added != 0.0, axis=1)).tolist()
+    exact = [_set_link(model, sim.joints, link, added[link]) for link in moved]
+    changed = tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
     for term in held:
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
             model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
         elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
-    for place, offset in offsets(estimate, held).items():
-        _move_zero(model, sim.joints[place], offset)
+    for place, offset in offsets(estimate, held).items():  # as the sensor counts: stops and spring stay where they are
+        joint = sim.joints[place]
+        adr = model.jnt_qposadr[joint]
+        model.qpos0[adr] -= offset
+        model.jnt_range[joint] -= offset * bool(model.jnt_limited[joint])
+        model.qpos_spring[adr] -= offset * bool(linear_part(model.jnt_stiffness, model.njnt)[joint])
     return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
-
-
-def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], number: int) -> tuple[str, ...]:
-    """Put the terms that change links into the model; the joints whose link could not be made as fitted."""
-    inertial = sim.arm.inertial.copy()
-    for term, c in terms:
-        change = inertial_change(term, c, inertial, number)
-        if change is not None:
-            inertial[sim.n - 1 if term.effect == "link.payload" else term.place] += change
-    moved = np.flatnonzero(np.any(inertial != sim.arm.inertial, axis=1)).tolist()
-    exact = [_set_link(model, sim.joints, link, inertial[link] - sim.arm.inertial[link]) for link in moved]
-    return tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
 
 
 def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
     """Add ten parameters to the body that a joint moves, or to it with all that is fixed to it if it alone could not
     exist (a gripper taken away); whether the result is what was wanted."""
-    import mujoco
-
     joint = joints[link]
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
     total = body_parameters(model, body, anchor, np.eye(3)) + added
@@ -129,22 +129,13 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
         whole = total + sum(beside, np.zeros(10))
         if fixed and may_exist(whole):
             total = whole
-            for other in fixed:
-                model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
+            for other in fixed:  # nearly nothing, since MuJoCo takes no body without a mass
+                model.body_mass[other], model.body_inertia[other] = 1e-9, 1e-9
     return set_body(model, body, anchor, total)
 
 
 def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
-
-
-def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> Any:
-    """A copy of the nominal model with its coupled motors, which only a model from a file can have."""
-    if sim.path is None or not any(term.effect == "transmission.coupling" for term in terms):
-        return copy.copy(sim.mujoco_model)
-    spec = named_spec(sim)
-    add_motors(spec, sim, estimate, terms)
-    return spec.compile()
 
 
 def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
@@ -167,16 +158,6 @@ def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
 def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:
     """Offsets of the position sensors that a model holds, by the joint's place [rad]."""
     return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
-
-
-def _move_zero(model: Any, joint: int, offset: float) -> None:
-    """Count the position of a joint as a sensor with this offset does: stops and spring stay where they are."""
-    adr = model.jnt_qposadr[joint]
-    model.qpos0[adr] -= offset
-    if model.jnt_limited[joint]:
-        model.jnt_range[joint] -= offset
-    if linear_part(model.jnt_stiffness, model.njnt)[joint]:
-        model.qpos_spring[adr] -= offset
 
 
 def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
@@ -237,8 +218,8 @@ def model_files(
     for joint, drive in drives.items():
         if joint in motors:
             put_drive(motors[joint], drive)
-    if any("actuator.delay" in drive and joint in motors for joint, drive in drives.items()):
-        spec.option.timestep = min(float(spec.option.timestep), STEP_S)
+            if "actuator.delay" in drive:
+                spec.option.timestep = min(float(spec.option.timestep), STEP_S)
     spec.compile()
     left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
     lines = [_line(sim, estimate, term) for term in left]

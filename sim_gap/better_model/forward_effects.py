@@ -56,15 +56,9 @@ PASSIVE = (
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
 """Length of a forward simulation from a recorded state, number of them over a recording, largest time step, also of a
 model whose actuators have delays."""
-AROUND_S = 0.06
-"""The state at the start of a simulation is that of a parabola through the readings this close to it [s]."""
 LOST, WILD = np.pi, 50.0
 """Limits of a joint's deviation [rad] and speed [rad/s]: without friction and rotor inertia a light joint would diverge
 and the simulation with it."""
-LOCKED = 1e9
-"""Armature of joints of the model that the recording does not have [kg·m²]: they stay at rest."""
-RESTING = 1e-4
-"""Speed below which a joint is at rest [rad/s], and its motor torque sets the direction of friction."""
 
 
 class Effects:
@@ -121,7 +115,7 @@ class Effects:
         fade = xp.exp(-((speed / self.values("friction.stribeck", "velocity", 1.0)) ** 2))
         level = self.coulomb + self.values("friction.stribeck", "breakaway") * fade
         level = level + self.values("friction.load", "coefficient") * xp.abs(carried)
-        heading = xp.where(xp.abs(speed) < RESTING, xp.sign(driven), xp.sign(speed))
+        heading = xp.where(xp.abs(speed) < 1e-4, xp.sign(driven), xp.sign(speed))  # at rest the motor sets it
         level = level * (1.0 + self.values("friction.asymmetric", "ratio") * heading)
         level = level + self.values("friction.bearing", "torque")
         angle = self.values("transmission.ripple", "cycles") * position
@@ -203,25 +197,17 @@ class Effects:
         An elastic transmission or one with backlash shows in the position, whose sensor is at the motor; its
         oscillation is neglected.
         """
-        torque = self.carried(model, data) - self._pushed(data)
+        rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
+        pushed = data.qfrc_constraint.copy()  # by stops and contacts on the links
+        pushed[data.efc_id[rows]] -= data.efc_force[rows]
+        torque = self.carried(model, data) - pushed[self.dofs]
         give = self._give(torque)
         return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
     @property
-    def rigid(self) -> bool:
-        """Whether the position sensors read the joints' own angles, whatever the torque."""
-        return not any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
-
-    def position(self, model: Any, data: Any) -> Array:
-        """Readings of the position sensors after a step [rad], (n,)."""
-        return self.angle(data.qpos[self.places]) if self.rigid else self.read(model, data)[0]
-
-    def _pushed(self, data: Any) -> Array:
-        """Torque of stops and contacts on the links, (n,)."""
-        rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-        push = data.qfrc_constraint.copy()
-        push[data.efc_id[rows]] -= data.efc_force[rows]
-        return np.asarray(push[self.dofs])
+    def is_elastic(self) -> bool:
+        """Whether the reading of a position depends on the torque."""
+        return any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
 
     def angle(self, true: Array) -> Array:
         """The reading φ with true = gain·φ + offset + amplitude·sin(φ + phase), (…, n)."""
@@ -268,12 +254,15 @@ def roll_out(
     `t` (K,) and readings (K, n) as recorded; `source` as in `Effects.drive`. NaN if the recording is shorter than a
     window. The model's contacts and limits are switched off; joints that the recording does not have are locked.
     """
-    _prepare(model, effects)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.dof_armature[np.setdiff1d(np.arange(model.nv), effects.dofs)] = 1e9  # locked: they stay at rest
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1], step)
     q, tau = (_even(even, t, values) for values in (position, torque))
     drive = effects.drive(even - even[0], tau, source)
-    steps, beside = round(horizon / step), max(2, round(AROUND_S / step))
+    # the state at the start is that of a parabola through the readings within 60 ms of it
+    steps, beside = round(horizon / step), max(2, round(0.06 / step))
     last = len(even) - steps - beside - 1
     if last <= beside:
         return np.full(len(effects.joints), np.nan)
@@ -300,12 +289,6 @@ def _even(even: Array, t: Array, values: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _prepare(model: Any, effects: Effects) -> None:
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-    model.dof_armature[np.setdiff1d(np.arange(model.nv), effects.dofs)] = LOCKED
-
-
 def _window(
     model: Any,
     effects: Effects,
@@ -321,14 +304,14 @@ def _window(
     data = mujoco.MjData(model)
     data.qpos[effects.places], data.qvel[effects.dofs] = state
     data.time = time
-    out, speed, rigid = np.empty_like(reading), data.qvel, effects.rigid
+    out, speed, elastic = np.empty_like(reading), data.qvel, effects.is_elastic
     for k in range(len(reading)):
         data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
         for _ in range(each):
             mujoco.mj_step(model, data)
             np.minimum(np.maximum(speed, -WILD, out=speed), WILD, out=speed)
-        out[k] = data.qpos[effects.places] if rigid else effects.position(model, data)
-    return np.clip((effects.angle(out) if rigid else out) - reading, -LOST, LOST)
+        out[k] = effects.read(model, data)[0] if elastic else data.qpos[effects.places]
+    return np.clip((out if elastic else effects.angle(out)) - reading, -LOST, LOST)
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:

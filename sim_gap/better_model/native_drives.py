@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from gcomp.arrays import Array
@@ -16,8 +17,6 @@ MOST_SAMPLES, LEAST_STEP_S = 1000, 0.0005
 
 def motors_of(spec: Any) -> dict[str, Any]:
     """The actuators of a `mujoco.MjSpec` that make a torque in proportion to their control, by joint name."""
-    import mujoco
-
     plain = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
     return {
         each.target: each
@@ -28,8 +27,6 @@ def motors_of(spec: Any) -> dict[str, Any]:
 
 def put_drive(motor: Any, found: Mapping[str, float]) -> None:
     """Give a motor what was found of its drive, effect → value: N·m, s, or the ratio of torque to command."""
-    import mujoco
-
     gear = np.array(motor.gear)
     if (limit := found.get("actuator.saturation")) is not None:
         most = limit / abs(gear[0])
@@ -72,8 +69,6 @@ def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> No
     joint there. The integral part of a PID holds what gravity and springs ask for. `data` has its positions; the
     commands are written to `ctrl`.
     """
-    import mujoco
-
     mujoco.mj_forward(model, data)
     asked_for = data.qfrc_bias - data.qfrc_passive
     pid, lags = mujoco.mjtDyn.mjDYN_PID, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)

@@ -164,8 +164,6 @@ def _entry(model: Any, sim: SimModel, j: int, found: dict[tuple[str, int], dict[
 
 
 SUFFIXES = (".csv", ".json", ".parquet")
-LEAST_DRAW_SHARE = 0.01
-"""A draw of a parameter that must be above zero is at least this share of its estimate."""
 
 
 def drawn_parameters(estimate: EffectEstimate, names: Sequence[str], count: int) -> list[dict[str, float]]:
@@ -188,14 +186,15 @@ def drawn_parameters(estimate: EffectEstimate, names: Sequence[str], count: int)
 
 
 def _accepted(effect: str, name: str, value: float, best: float) -> float:
-    """A value within the bounds that the simulated arm has for it: no friction, rotor or play is below zero."""
+    """A value within the bounds that the simulated arm has for it: no friction, rotor or play is below zero, and what
+    must be above it is 1 % of its estimate or more."""
     known = simulated().get(effect)
     one = next((each for each in known.parameters if each.name == name), None) if known else None
     if one is None or not one.accepts(best):
         return value
     least, above = one.domain.least, one.domain.above
     value = value if least is None else max(value, least)
-    return value if above is None else max(value, above + LEAST_DRAW_SHARE * (best - above))
+    return value if above is None else max(value, above + 0.01 * (best - above))
 
 
 def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:

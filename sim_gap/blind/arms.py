@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from scipy import constants
 
+from gcomp.arm.inertials import steiner
 from gcomp.arrays import Array
 
 
@@ -53,19 +55,19 @@ class BenchArm:
         """The arm with mass [kg], first moment [kg·m] and inertia about the link's origin [kg·m²] added to one link."""
         total = self.mass[link] + mass
         com = (self.mass[link] * self.com[link] + moment) / total
-        about_origin = self.inertia[link] + self.mass[link] * _steiner(self.com[link]) + inertia
-        heavier = self.with_entry("mass", link, total).with_entry("com", link, com)
-        return heavier.with_entry("inertia", link, about_origin - total * _steiner(com))
+        about_origin = self.inertia[link] + self.mass[link] * steiner(self.com[link]) + inertia
+        return self.with_entries(link, mass=total, com=com, inertia=about_origin - total * steiner(com))
 
-    def with_entry(self, quantity: str, joint: int, value: float | Array) -> "BenchArm":
-        """The arm with another value of one link or joint in the array `quantity`."""
-        values = getattr(self, quantity).copy()
-        values[joint] = value
-        return replace(self, **{quantity: values})
+    def with_entries(self, joint: int, **entries: float | Array) -> "BenchArm":
+        """The arm with other values of one link or joint in some of its arrays."""
+        arrays = {name: getattr(self, name).copy() for name in entries}
+        for name, value in entries.items():
+            arrays[name][joint] = value
+        return replace(self, **arrays)
 
     def with_moved(self, link: int, moment: Array) -> "BenchArm":
         """The arm with the centre of mass of one link moved so that its first moment grows by `moment` [kg·m]."""
-        return self.with_entry("com", link, self.com[link] + moment / self.mass[link])
+        return self.with_entries(link, com=self.com[link] + moment / self.mass[link])
 
 
 def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm:
@@ -176,14 +178,8 @@ def _rod(mass: float, bone: Array, random: np.random.Generator) -> Array:
     return np.asarray(turn @ rod @ turn.T)
 
 
-def _steiner(point: Array) -> Array:
-    return np.asarray(point @ point * np.eye(3) - np.outer(point, point))
-
-
 def compile_arm(arm: BenchArm) -> Any:
     """The arm's links and rotors as a MuJoCo model without friction, damping or limits."""
-    import mujoco
-
     model, off = mujoco.MjModel.from_xml_string(mjcf(arm)), mujoco.mjtDisableBit
     for part in ("CONSTRAINT", "CONTACT", "SENSOR", "ACTUATION", "DAMPER", "SPRING"):
         model.opt.disableflags |= int(getattr(off, f"mjDSBL_{part}"))
@@ -192,8 +188,6 @@ def compile_arm(arm: BenchArm) -> Any:
 
 def inverse(model: Any, q: Array, v: Array, a: Array) -> Array:
     """Torques M(q) a + C(q, v) v + ∂V/∂q [N·m] along a trajectory, (K, n) each; rotors as in the model."""
-    import mujoco
-
     data, out = mujoco.MjData(model), np.empty(q.shape)
     qpos, qvel, qacc, torque = data.qpos, data.qvel, data.qacc, data.qfrc_inverse
     for k in range(len(q)):

@@ -1,18 +1,14 @@
-"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases '{"out": …}'`, see `make_cases`."""
+"""Makes the cases of the blind check, and says which of them are diagnosed again without their effect."""
 
 import json
-import os
-import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from multiprocessing import get_context
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
@@ -21,29 +17,25 @@ from sim_gap.blind.arms import inverse, mjcf
 from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import RATE, RECORDED_HZ
 from sim_gap.blind.plant import TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
-from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, recipes, servo_recipes
-from sim_gap.blind.scene import LEAST_SPEED, ServoLaw
+from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw
+from sim_gap.blind.scene import LEAST_SPEED, ServoLaw, rms
 from sim_gap.blind.servo_plant import record_servos, simulate_servos
 
-SERVO_HZ = 50.0, 100.0
-"""Rates of the recordings of positions alone [Hz]."""
-BAND_HZ = 6.0
-"""Band in which a gap counts [Hz]."""
 VISIBLE_RATIO, VISIBLE_LEAST, VISIBLE_COUNTS = 3.0, 0.08, 2.0
 """Least factor on some held-out gap, and least increase of it by a visible effect: [N·m], and of positions alone counts
 of the encoder."""
 CHANNEL_SHARES = {"dq": 0.5, "q_cmd": 0.8, "tau_cmd": 0.8}
 """Channel that not every case has → share of those that do; that of tau_cmd is 1 for effects of drives."""
-ROUNDS = 4
-"""Number of drawings of a case that does not show its effects."""
 FOLLOWED, SERVO_FOLLOWED = 0.3, 0.6
 """Largest deviation from the command [rad] of an arm under control, and of one with servos."""
-SETTLING_S = 1.0
-"""Time at the start of a run of positions alone that is not judged [s]."""
 DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
 """Of a column in a file; 5 of the others."""
+JOINT_TOTALS = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
+"""Effects of which positions show all that a joint has, with what the model has of it."""
 Columns = dict[str, Array]
 Gap = dict[str, list[float]]
+Totals = dict[str, list[float]]
+"""True values of each joint, small errors of every arm included, by `EFFECT:QUANTITY`."""
 
 
 def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
@@ -57,13 +49,7 @@ def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-def is_visible(fall: dict[str, Any], least: float) -> bool:
-    """Whether the gap caused by an effect exceeds that of every arm clearly."""
-    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
-
-
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One motion of a true arm."""
 
     columns: Columns
@@ -90,8 +76,7 @@ class Rig:
     def noise(self, number: int) -> np.random.Generator:
         return np.random.default_rng([*self.drawing.recipe.seed, self.drawing.attempt, number])
 
-    def totals(self) -> dict[str, list[float]]:
-        """The true values of each joint, small errors of every arm included, by effect and quantity."""
+    def totals(self) -> Totals:
         truth = self.truth(self.drawing.drawn)
         state = truth.state
         values = {
@@ -117,7 +102,7 @@ class TorqueRig(Rig):
         missing = {name for name, share in CHANNEL_SHARES.items() if drawing.random.random() >= share}
         of_drives = any(effect.startswith("actuator") for effect in drawing.recipe.effects)
         self.missing = frozenset(missing - {"tau_cmd"} if of_drives else missing)
-        self.sim, self.label = mjcf(self.scene.arm), label_of(drawing)
+        self.sim = mjcf(self.scene.arm)
 
     def run(self, number: int, command: Array, effects: Sequence[DrawnEffect]) -> Trial:
         """The command of motion `number` under these effects."""
@@ -129,13 +114,11 @@ class TorqueRig(Rig):
 
     def gap(self, trial: Trial) -> Gap:
         """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
-        from scipy.signal import butter, sosfiltfilt
-
         arm, columns = self.scene.arm, trial.columns
         t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RECORDED_HZ)
         even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
-        low = butter(4, BAND_HZ, fs=RECORDED_HZ, output="sos")
-        q = sosfiltfilt(butter(4, 15.0, fs=RECORDED_HZ, output="sos"), even["q"], axis=0)
+        low, smooth = (butter(4, hz, fs=RECORDED_HZ, output="sos") for hz in (6.0, 15.0))
+        q = sosfiltfilt(smooth, even["q"], axis=0)
         v = np.gradient(q, 1.0 / RECORDED_HZ, axis=0)
         a = np.gradient(v, 1.0 / RECORDED_HZ, axis=0)
         motor = inverse(self.scene.model, q, v, a)
@@ -156,34 +139,21 @@ class ServoRig(Rig):
 
     def __init__(self, drawing: CaseDrawing) -> None:
         super().__init__(drawing)
-        arm, law = drawing.nominal, drawing.scene.law
+        arm, law = self.scene.arm, self.scene.law
         assert law is not None
-        self.law, self.limit, self.hz = law, 2.0 * self.scene.rated, float(drawing.random.choice(SERVO_HZ))
+        self.law, self.limit, self.hz = law, 2.0 * self.scene.rated, float(drawing.random.choice((50.0, 100.0)))
         self.encoder_step = 2 * np.pi / 2 ** int(drawing.random.integers(12, 16))
         self.least_fall = VISIBLE_COUNTS * self.encoder_step
         self.small = np.random.default_rng([self.seed, 5]).uniform(0.99, 1.01, (2, arm.n))
-        known = bool(drawing.recipe.controller_known)
         rows = [
             f'<position name="{name}" joint="{name}" kp="{kp:.9g}" kv="{kv:.9g}" forcerange="{-top:.9g} {top:.9g}"/>'
             for name, kp, kv, top in zip(arm.names, law.stiffness, law.damping, self.limit, strict=True)
         ]
-        self.sim = mjcf(arm, ["<actuator>", *rows, "</actuator>"] if known else ())
-        self.label = {**label_of(drawing), "controller_known": known}
-        for effect in self.label["effects"]:
-            self._report_whole(effect)
-
-    def _report_whole(self, told: dict[str, Any]) -> None:
-        """Friction and inertia are answered as all of a joint's, with what the model has of it."""
-        truth, names = self.truth(self.drawing.drawn), self.drawing.nominal.names
-        servo = self.law.damping * self.small[1] if self.label["controller_known"] else 0.0
-        whole = {
-            "friction.coulomb": ("torque", truth.state.coulomb),
-            "friction.viscous": ("damping", truth.state.viscous + servo),
-            "actuator.rotor_inertia": ("inertia", truth.arm.armature + truth.state.rotor_inertia),
-        }
-        if told["effect"] in whole:
-            name, values = whole[told["effect"]]
-            told["parameters"] = {joint: {name: float(values[names.index(joint)])} for joint in told["parameters"]}
+        self.sim = mjcf(arm, ["<actuator>", *rows, "</actuator>"] if drawing.recipe.controller_known else ())
+        state = imperfections(arm.names, ())
+        state.coulomb, state.viscous, state.actuator_saturation = arm.frictionloss, arm.damping, self.limit
+        self.nominal = simulate_servos(replace(self.truth(()), arm=arm, state=state), self.held(drawing.heldout), law)
+        """Held-out positions of the nominal model (K, n) [rad]."""
 
     def truth(self, effects: Sequence[DrawnEffect]) -> TrueArm:
         truth = super().truth(effects)
@@ -205,7 +175,7 @@ class ServoRig(Rig):
             effect.law(law)
         return law
 
-    def totals(self) -> dict[str, list[float]]:
+    def totals(self) -> Totals:
         """As without servos; damping is the joint's and the servo's together, since a position cannot tell them."""
         law, values = self.true_law(self.drawing.drawn), super().totals()
         damping = np.add(values["friction.viscous:damping"], law.damping).tolist()
@@ -215,28 +185,19 @@ class ServoRig(Rig):
         rows = round(RATE / self.hz)
         return command[np.arange(len(command)) // rows * rows]
 
-    @cached_property
-    def ideal(self) -> Array:
-        """Held-out positions of the nominal model (K, n) [rad]."""
-        arm = self.scene.arm
-        state = imperfections(arm.names, ())
-        state.coulomb, state.viscous, state.actuator_saturation = arm.frictionloss, arm.damping, self.limit
-        return simulate_servos(replace(self.truth(()), arm=arm, state=state), self.held(self.drawing.heldout), self.law)
-
     def gap(self, trial: Trial) -> Gap:
-        """RMS [rad] of held-out positions against those of the nominal model."""
-        judged = slice(round(SETTLING_S * RATE), None)
-        return {"q": np.sqrt(np.mean((trial.position - self.ideal)[judged] ** 2, axis=0)).tolist()}
+        """RMS [rad] of held-out positions against those of the nominal model, but for the first second."""
+        return {"q": rms((trial.position - self.nominal)[round(RATE) :]).tolist()}
 
 
 def make_case(recipe: CaseRecipe, out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
     """Draw, simulate and write a case: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
 
-    It is drawn again if its effects do not show in the held-out data or its arm is not steady, and left out after
-    ROUNDS drawings, or if no arm can show them.
+    It is drawn again if its effects do not show in the held-out data or its arm is not steady, and left out after four
+    drawings, or if no arm can show them.
     """
     first = 0
-    for _ in range(ROUNDS):
+    for _ in range(4):
         drawing = draw(recipe, train_s, heldout_s, first)
         if drawing is None or write_case(drawing, out / recipe.name, labels / f"{recipe.name}.json"):
             return
@@ -251,9 +212,10 @@ def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
     trials = [rig.run(1, drawing.heldout, effects) for effects in sets]
     gaps = [rig.gap(trial) for trial in trials]
     # channels that are not recorded do not make a case clear
-    *alone, sound = [{name: rms for name, rms in each.items() if name not in rig.missing} for each in gaps]
+    *alone, sound = [{name: gap for name, gap in each.items() if name not in rig.missing} for each in gaps]
     falls = [largest_fall(each, sound) for each in alone[-len(drawn) :] if drawn]
-    if not (several or all(is_visible(fall, rig.least_fall) for fall in falls)):
+    pairs = [(fall["before"], fall["after"]) for fall in falls]
+    if not (several or all(b > VISIBLE_RATIO * a and b - a > rig.least_fall for b, a in pairs)):
         return False
     training = rig.run(0, drawing.scene.command, drawn)
     if not all(trial.is_steady for trial in (training, *trials)):
@@ -264,20 +226,20 @@ def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
     for name, trial in (("train", training), ("heldout", trials[0])):
         recorded = {channel: values for channel, values in trial.columns.items() if channel not in rig.missing}
         write_csv(folder / f"{name}.csv", recorded)
-    told = {"gap": {"with": gaps[0], "without": gaps[-1], "falls": falls}, "clear": True}
-    told["totals"] = rig.totals()
-    label.write_text(json.dumps({**rig.label, **told}, indent=1), encoding="utf-8")
+    gap, totals = {"with": gaps[0], "without": gaps[-1], "falls": falls}, rig.totals()
+    told = {**label_of(drawing, totals), "gap": gap, "clear": True, "totals": totals}
+    label.write_text(json.dumps(told, indent=1), encoding="utf-8")
     return True
 
 
-def label_of(drawing: CaseDrawing) -> dict[str, Any]:
-    """The true effects of the case, for the score."""
-    chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
+def label_of(drawing: CaseDrawing, totals: Totals) -> dict[str, Any]:
+    """The true effects of the case, for the score; `totals` of the arm with these effects."""
+    chirp, nominal = "chirp" in drawing.motions["train"], drawing.scene.arm
     effects = [
         {
             "effect": d.effect,
             "joints": list(d.joints),
-            "parameters": d.parameters,
+            "parameters": _reported(d, nominal.names, totals) if drawing.recipe.servos else d.parameters,
             "axis": nominal.axis[nominal.names.index(d.joints[0])].tolist() if d.joints else None,
             "implied": list(d.implied),
             "undecided": "" if chirp and d.effect in ("actuator.lag", "actuator.delay") else d.undecided,
@@ -285,6 +247,7 @@ def label_of(drawing: CaseDrawing) -> dict[str, Any]:
         }
         for d in drawing.drawn
     ]
+    known = {"controller_known": drawing.recipe.controller_known} if drawing.recipe.servos else {}
     return {
         "schema": "armlink.blind-label/1",
         "case": drawing.recipe.name,
@@ -292,7 +255,17 @@ def label_of(drawing: CaseDrawing) -> dict[str, Any]:
         "n": nominal.n,
         "effects": effects,
         "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
+        **known,
     }
+
+
+def _reported(drawn: DrawnEffect, names: Sequence[str], totals: Totals) -> dict[str, dict[str, float]]:
+    """Parameters of an effect as positions alone show them: friction and inertia of a joint with what the model has."""
+    for key, values in totals.items():
+        effect, _, name = key.partition(":")
+        if effect == drawn.effect and effect in JOINT_TOTALS:
+            return {joint: {name: values[names.index(joint)]} for joint in drawn.joints}
+    return drawn.parameters
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:
@@ -305,32 +278,17 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
         write_numbers(file, flat)
 
 
-def make_cases(
-    out: str, seed: int, cases: int, workers: int, lengths: Sequence[float], effects: str = "", positions: bool = False
-) -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    low, _, high = effects.partition("-")
-    wanted = recipes(seed, cases, (int(low), int(high)) if high else None)
-    labels, train_s, heldout_s = Path(out) / "labels", *lengths
-    labels.mkdir(parents=True, exist_ok=True)
-    make = partial(make_case, out=Path(out) / "cases", labels=labels, train_s=train_s, heldout_s=heldout_s)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        list(pool.map(make, servo_recipes(seed, cases) if positions else wanted))
-    withheld = draw_withheld(labels, 1)[::3] if positions else draw_withheld(labels)
-    (labels / "withhold.txt").write_text("\n".join(withheld), encoding="utf-8")
+def write_withheld(labels: Path, positions: bool) -> None:
+    """List what is to be diagnosed again without the true effect in `withhold.txt`, a line "CASE EFFECT" each.
 
-
-def draw_withheld(labels: Path, each: int = 2) -> list[str]:
-    """Lines "case effect": the first `each` single-effect cases of every effect that the recording can separate."""
+    The first two single-effect cases of every effect that the recording can separate; of positions alone the first, of
+    every third effect.
+    """
     chosen: dict[str, list[str]] = {}
     for path in sorted(labels.glob("*.json")):
         truth = json.loads(path.read_text(encoding="utf-8"))
         if truth["kind"] == "single" and not truth["effects"][0]["undecided"]:
-            cases = chosen.setdefault(truth["effects"][0]["effect"], [])
-            if len(cases) < each:
-                cases.append(truth["case"])
-    return [f"{case} {effect}" for effect in sorted(chosen) for case in chosen[effect]]
-
-
-if __name__ == "__main__":
-    make_cases(**json.loads(sys.argv[1]))
+            chosen.setdefault(truth["effects"][0]["effect"], []).append(truth["case"])
+    each, turn = (1, 3) if positions else (2, 1)
+    lines = [f"{case} {effect}" for effect in sorted(chosen)[::turn] for case in chosen[effect][:each]]
+    (labels / "withhold.txt").write_text("\n".join(lines), encoding="utf-8")

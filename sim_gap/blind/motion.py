@@ -11,8 +11,6 @@ RATE = 500.0
 RECORDED_HZ = RATE / 2
 """Rate of the recordings with torques [Hz]."""
 KINDS = ("sines", "points", "sweeps")
-LONGEST_CHIRP_S = 12.0
-"""Longest chirp [s]; it takes at most a fifth of the motion."""
 SLOWEST, LONGEST_REST_S, NEAREST = 0.4, 0.9, 0.01
 """Moves from point to point: least share of the limits, longest rest between them [s], least distance [rad]."""
 
@@ -37,14 +35,16 @@ class MotionLimits:
 
 
 def trajectory(kinds: tuple[str, ...], duration: float, limits: MotionLimits, random: np.random.Generator) -> Array:
-    """Positions (K, n) [rad] at `RATE` over `duration` seconds, equal parts of each kind, at rest at both ends."""
+    """Positions (K, n) [rad] at `RATE` over `duration` seconds, equal parts of each kind, at rest at both ends.
+
+    A chirp, at the end, takes a fifth of the motion, but 12 s at most.
+    """
     makers = {"sines": _sines, "points": _points, "sweeps": _sweeps, "chirp": _chirp}
     rows = round(duration * RATE)
-    chirp = round(min(LONGEST_CHIRP_S, 0.2 * duration) * RATE) if "chirp" in kinds else 0
-    slow = [kind for kind in kinds if kind != "chirp"]
-    ends = np.linspace(0, rows - chirp, len(slow) + 1).astype(int)
-    lengths = [*np.diff(ends).tolist(), *([chirp] * bool(chirp))]
-    order = [*slow, *(["chirp"] * bool(chirp))]
+    chirp = round(min(12.0, 0.2 * duration) * RATE) if "chirp" in kinds else 0
+    order = sorted(kinds, key="chirp".__eq__)
+    ends = np.linspace(0, rows - chirp, len(order) - ("chirp" in kinds) + 1).astype(int)
+    lengths = np.diff([*ends, *[rows] * ("chirp" in kinds)]).tolist()
     parts = [makers[kind](np.arange(k) / RATE, limits, random) for kind, k in zip(order, lengths, strict=True)]
     return np.asarray(limits.centre + np.concatenate(parts))
 
@@ -81,9 +81,7 @@ def _points(t: Array, limits: MotionLimits, random: np.random.Generator) -> Arra
         if left < seconds + _seconds(there, limits, SLOWEST):  # no time to return
             there, seconds = np.zeros(n), _seconds(here, limits, random.uniform(SLOWEST, 1.0))
         rows = round(seconds * RATE)
-        s = np.minimum(np.arange(rows) / max(rows - 1, 1), 1.0)[:, None]
-        rise = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-        block = here + (there - here) * rise
+        block = here + (there - here) * _quintic(np.arange(rows) / max(rows - 1, 1))[:, None]
         keep = min(rows, len(t) - now)
         out[now : now + keep] = block[:keep]
         rest = now + rows + round(random.uniform(0.2, LONGEST_REST_S) * RATE)
@@ -124,7 +122,10 @@ def _chirp(t: Array, limits: MotionLimits, random: np.random.Generator) -> Array
 
 def _window(t: Array) -> Array:
     """Rises from 0 to 1 and falls back within 3 s (a quarter of a short motion), C² at both ends."""
-    s = np.clip(np.minimum(t, t[-1] - t) / min(3.0, 0.25 * t[-1]), 0.0, 1.0)
+    return _quintic(np.clip(np.minimum(t, t[-1] - t) / min(3.0, 0.25 * t[-1]), 0.0, 1.0))
+
+
+def _quintic(s: Array) -> Array:
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
 
 

@@ -23,18 +23,11 @@ from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import RATE, RECORDED_HZ
 from sim_gap.blind.scene import Scene
 
-VELOCITY_HZ = 40.0
-"""Low pass of the velocity in the controller, which a drive reports too [Hz]."""
-INTEGRAL_S = 1.5
-"""Stiffness over integral gain [s]."""
-DAMPING_RATIO = 0.9
 LATE_PHASE = 0.35
 """Bandwidth of the controller times a drive's lag and delay, at most [rad]."""
 ENCODER_NOISE = 0.4
 """Standard deviation of a position reading before it is rounded, in counts."""
 JITTER_S = 4e-4
-LATE_SHARE, LOST_SHARE = 0.003, 0.001
-"""Share of rows that are late by a good part of a period, and share of rows that are lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +132,14 @@ def plant_at_rest(truth: TrueArm, angle: Array, torque: Array) -> Plant:
 
 def simulate(truth: TrueArm, scene: Scene, command: Array, bandwidth: Array, seed: int) -> Log:
     """The arm along a command (K, n) [rad] under a PID controller of a bandwidth (n,) [rad/s], the nominal torque fed
-    forward, on quantised and noisy readings."""
+    forward, on quantised and noisy readings; the velocity is theirs below 40 Hz."""
     sensors, feed_forward = joint_sensors(truth), scene.feed_forward(command)
     plant = plant_at_rest(truth, sensors.angle_of(command[0]), feed_forward[0])
     step, period = truth.encoder_step, 1.0 / RATE
     speed = np.diff(command, axis=0, prepend=command[:1]) * RATE
     noise = ENCODER_NOISE * np.random.default_rng([seed, 1]).standard_normal(command.shape)
-    stiffness, damping = scene.inertia * bandwidth**2, 2 * DAMPING_RATIO * scene.inertia * bandwidth
-    smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
+    stiffness, damping = scene.inertia * bandwidth**2, 2 * 0.9 * scene.inertia * bandwidth
+    smooth = 1.0 - np.exp(-2 * np.pi * 40.0 / RATE)
     before, velocity, error_sum = command[0], np.zeros(plant.n), np.zeros(plant.n)
     log = Log(*np.empty((5, *command.shape)))
     for tick, target in enumerate(command):
@@ -154,7 +147,7 @@ def simulate(truth: TrueArm, scene: Scene, command: Array, bandwidth: Array, see
         velocity += smooth * ((seen - before) * RATE - velocity)
         before, error = seen, target - seen
         error_sum += error * period
-        torque = feed_forward[tick] + stiffness * (error + error_sum / INTEGRAL_S)
+        torque = feed_forward[tick] + stiffness * (error + error_sum / 1.5)
         torque += damping * (speed[tick] - velocity)
         plant.step(torque, torque, period)
         # torques are those at the start of the last step of the physics, so positions have to be
@@ -186,12 +179,12 @@ def record(truth: TrueArm, command: Array, log: Log, random: np.random.Generator
 
 
 def _times(duration: float, rate: float, random: np.random.Generator) -> Array:
-    """Uneven times: jitter on every row, some rows late, a few lost."""
+    """Uneven times: jitter on every row, 0.3 % late by a good part of a period, 0.1 % lost."""
     t = np.arange(0.0, duration - 2.0 / rate, 1.0 / rate)
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.4 / rate, 0.4 / rate)
-    late = random.random(len(t)) < LATE_SHARE
+    late = random.random(len(t)) < 0.003
     t[late] += random.uniform(0.1, 0.3, int(late.sum())) / rate
-    kept = random.random(len(t)) >= LOST_SHARE
+    kept = random.random(len(t)) >= 0.001
     kept[0] = True
     return np.asarray(np.sort(t)[kept])
 

@@ -1,82 +1,56 @@
 """The bench of real arms: recordings of a folder, diagnosed and sealed before what is known of the arms is read.
 
-What is known stands in `real_arms.yaml`, or in a file of the same form that is given: effects that an arm has (`has`),
+What is known stands in `real_arms.yaml`: effects that an arm has (`has`),
 of which one has to come first, those that have to be named, and those that nobody knows (`open`), which do not count.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from armlink.arm_file import read_yaml
-from armlink.errors import ArmlinkError, BadInput
+from armlink.errors import BadInput
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, slice_rows
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.blind.bench import seal, verify, write_answer
-from sim_gap.blind.judge import CONFIDENT
-from sim_gap.blind.score import WITHHELD, answer_name, share
+from sim_gap.blind.bench import Json, Progress, refuse_earlier, seal_answers, verify
+from sim_gap.blind.score import CONFIDENT, WITHHELD, answer_name, share
 
 SCHEMA = "armlink.real-bench/1"
 KNOWN = Path(__file__).with_name("real_arms.yaml")
 RIGHT_FIRST, FALSE = 0.85, 0.05
 """Required shares: right first, and cases with a false cause above 0.8."""
-Json = dict[str, Any]
 
 
 def run_real(
-    folder: Path,
-    out: Path,
-    known: Path = KNOWN,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    folder: Path, out: Path, known: Path = KNOWN, progress: Progress = lambda *_: None, workers: int = 1
 ) -> Json:
     """Diagnose the recordings of `folder`, seal the answers under `out`, then score them.
 
     Sets whose files are missing are left out and listed. Raises BadInput if none is there, or `out` holds an earlier
     bench.
     """
-    if (out / "answers").exists():
-        raise BadInput(f"{out} holds an earlier check: give another folder with --out, or remove this folder")
-    cases = read_cases(known)
+    refuse_earlier(out)
+    cases: list[Json] = read_yaml(known)
     missing = [case["case"] for case in cases if not all((folder / name).is_file() for name in _files(case))]
     here = [case for case in cases if case["case"] not in missing]
     if not here:
         raise BadInput(f"{folder} holds none of the recordings of {known}: expected for example {_files(cases[0])[0]}")
     tasks = [(case, effect) for case in here for effect in ("", *case.get("withhold", ()))]
-    for done, (case, effect) in enumerate(tasks, start=1):
-        write_answer(out / "answers", answer_name(case["case"], effect), _answer(folder, case, effect))
-        progress("diagnosing", done, len(tasks))
-    digest = seal(out / "answers")
+    jobs = {answer_name(case["case"], effect): partial(diagnose_real, folder, case, effect) for case, effect in tasks}
+    digest = seal_answers(out / "answers", jobs, workers, progress)
     return {**score_real(verify(out / "answers", digest), here), "sealed": digest, "missing": missing}
-
-
-def read_cases(known: Path) -> list[Json]:
-    """The cases of a file, in the form of `real_arms.yaml`. Raises BadInput if it is not of that form."""
-    try:
-        cases = read_yaml(known)
-    except OSError as error:
-        raise BadInput(f"{known}: cannot be read: {error.strerror}") from None
-    for number, case in enumerate(cases if isinstance(cases, list) else [cases], start=1):
-        lacking = [key for key in ("case", "sim", "train") if not isinstance(case, dict) or key not in case]
-        if isinstance(case, dict) and not case.get("refused"):
-            lacking += [key for key in ("first", "has") if key not in case]
-        if lacking:
-            raise BadInput(f"{known}: entry {number} lacks {', '.join(lacking)}: write the entry as in {KNOWN.name}")
-    return list(cases)
 
 
 def _files(case: Json) -> list[str]:
     return [case["sim"], *case["train"], *case.get("heldout", ())]
 
 
-def _answer(folder: Path, case: Json, withheld: str) -> Json:
-    """The answer to one case; refused input is an answer without causes."""
-    try:
-        train, heldout, labels = recordings_of(folder, case)
-        made = diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=[withheld] if withheld else [])
-    except ArmlinkError as error:
-        return {"verdict": "refused", "causes": [], "refused": str(error)}
-    return made.to_json()
+def diagnose_real(folder: Path, case: Json, withheld: str) -> Json:
+    train, heldout, labels = recordings_of(folder, case)
+    less = [withheld] if withheld else []
+    return diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=less).to_json()
 
 
 def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recording], list[str]]:
@@ -92,10 +66,8 @@ def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recor
 def score_real(answers: Mapping[str, Mapping[str, Any]], cases: Sequence[Json]) -> Json:
     """Score answers (by name) against what is known of the arms; shares over no case are None. Pure."""
     known = {case["case"]: case for case in cases}
-    rows = []
-    for name, answer in answers.items():
-        case, _, withheld = name.partition(WITHHELD)
-        rows.append(judge_real(answer, known[case], withheld))
+    named = ((*name.partition(WITHHELD)[::2], answer) for name, answer in answers.items())
+    rows = [judge_real(answer, known[case], withheld) for case, withheld, answer in named]
     whole = [row for row in rows if not row["withheld"] and row["first_right"] is not None]
     judged = [row for row in rows if row["verdict"] != "refused"]
     shares = {
@@ -117,7 +89,7 @@ def judge_real(answer: Mapping[str, Any], case: Json, withheld: str = "") -> Jso
     return {
         "case": case["case"],
         "withheld": withheld or None,
-        "verdict": answer["verdict"],
+        "verdict": "refused" if "refused" in answer else answer["verdict"],
         "first": first["effect"] if first else None,
         "confidence": first["confidence"] if first else None,
         "first_right": None if case.get("refused") else bool(first and first["effect"] in case["first"]),
@@ -128,8 +100,7 @@ def judge_real(answer: Mapping[str, Any], case: Json, withheld: str = "") -> Jso
 
 def _named(causes: Sequence[Mapping[str, Any]], effect: str, bounds: Mapping[str, Sequence[float]]) -> bool:
     """Whether an effect is among the causes, with parameters within these bounds at some joint."""
-    for cause in causes:
-        if cause["effect"] == effect:
-            values = list(cause["parameters"].values())
-            return all(any(low <= v[name]["value"] <= high for v in values) for name, (low, high) in bounds.items())
-    return False
+    values = next((list(cause["parameters"].values()) for cause in causes if cause["effect"] == effect), None)
+    return values is not None and all(
+        any(low <= v[name]["value"] <= high for v in values) for name, (low, high) in bounds.items()
+    )

@@ -16,8 +16,7 @@ ATTEMPTS = 600
 OTHER_PAIR = 20
 """Number of arms drawn for two effects before two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
-UNKNOWN_SHARE = 0.3
-"""Share of the cases of positions alone whose model has no controller."""
+"""Shares of the cases without an effect, and with two."""
 INDISTINCT = (
     {"actuator.lag", "actuator.delay"},
     {"link.payload", "link.mass_moment"},
@@ -71,10 +70,6 @@ class CaseDrawing:
     random: np.random.Generator
     """Source of everything else that is drawn for the case."""
 
-    @property
-    def nominal(self) -> BenchArm:
-        return self.scene.arm
-
 
 def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> list[CaseRecipe]:
     """`count` cases: every effect in turn, and among them arms without an effect and with two effects.
@@ -99,9 +94,9 @@ def _pair(random: np.random.Generator) -> tuple[str, ...]:
 
 
 def servo_recipes(seed: int, count: int) -> list[CaseRecipe]:
-    """`count` cases of positions alone, every effect in turn."""
+    """`count` cases of positions alone, every effect in turn; the model of three in ten has no controller."""
     random = np.random.default_rng([seed, 7])
-    known = random.random(count) > UNKNOWN_SHARE
+    known = random.random(count) > 0.3
     none = random.permutation(count) < round(NONE_SHARE * count)
     every = [*controller.DRAWS, *controller.OF_THE_ARM]
     orders = {True: random.permutation(every).tolist(), False: random.permutation(controller.UNKNOWN).tolist()}
@@ -130,7 +125,10 @@ def draw(recipe: CaseRecipe, train_s: float, heldout_s: float, first: int = 0) -
         training += ("chirp",) * bool(random.random() < 0.5)
         scene = Scene(arm, trajectory(training, train_s, limits, random))
         if recipe.servos:
-            scene.law = _servo_law(scene, random)
+            omega, none = 2 * np.pi * random.uniform(2.5, 5.0, arm.n), np.zeros((3, arm.n))
+            damping = 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega
+            unlimited = np.full(arm.n, np.inf)
+            scene.law = ServoLaw(scene.inertia * omega**2, damping, none[0], none[1], unlimited, none[2])
         drawn = _several(recipe.several, scene, random) if recipe.several else _named(recipe.effects, scene, random)
         if drawn is None:
             continue
@@ -169,12 +167,6 @@ def _limits(arm: BenchArm, servos: bool, random: np.random.Generator) -> MotionL
     velocity = np.linspace(random.uniform(0.8, 1.3), random.uniform(1.5, 2.6), arm.n)
     acceleration = np.linspace(random.uniform(2.5, 4.0), random.uniform(6.0, 10.0), arm.n)
     return MotionLimits(arm.lower, arm.upper, velocity, acceleration)
-
-
-def _servo_law(scene: Scene, random: np.random.Generator) -> ServoLaw:
-    omega, zero = 2 * np.pi * random.uniform(2.5, 5.0, scene.arm.n), np.zeros((3, scene.arm.n))
-    damping = 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega
-    return ServoLaw(scene.inertia * omega**2, damping, zero[0], zero[1], np.full(scene.arm.n, np.inf), zero[2])
 
 
 def _compatible(first: DrawnEffect, second: DrawnEffect) -> bool:

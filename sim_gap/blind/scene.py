@@ -110,13 +110,7 @@ class Scene:
 
     def change(self, other: BenchArm) -> Array:
         """Change of the link-side torque with another arm in place of this one, (K', n)."""
-        model = compile_arm(other)
-        return inverse(model, *self.motion) - other.armature * self.motion[2] - self.torque
-
-    def change_at_rest(self, other: BenchArm) -> Array:
-        """Change of the gravity torque with another arm in place of this one, (K', n)."""
-        still = np.zeros_like(self.motion[0])
-        return inverse(compile_arm(other), self.motion[0], still, still) - self.gravity
+        return inverse(compile_arm(other), *self.motion) - other.armature * self.motion[2] - self.torque
 
     def sensor_level(self, random: np.random.Generator) -> Array:
         """RMS that an effect should cause in `tau` − model, (n,) [N·m]."""

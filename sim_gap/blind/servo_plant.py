@@ -11,6 +11,7 @@ g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 
 from gcomp.arrays import Array
@@ -21,17 +22,12 @@ from sim_gap.blind.motion import RATE
 from sim_gap.blind.plant import JITTER_S, TrueArm, columns_at
 from sim_gap.blind.scene import ServoLaw
 
-SUBSTEPS = 4
-STEP = 1.0 / (RATE * SUBSTEPS)
+STEP = 0.25 / RATE
 """Time step [s]: springs must be slower."""
 ENCODER_NOISE = 0.2
 """Standard deviation of a recorded position before it is rounded, in counts."""
-ELASTIC_SHARE = 0.7
-"""Deflection of the bristles, as a share of z_ss, up to which α is 0."""
 STIFFEST = 0.05
 """Stiffness of bristles, and of a gear with play, times the square of the time step over inertia, for a stable step."""
-LEAST_INERTIA = 0.01
-"""Least inertia that a motor is taken to move [kg·m²]."""
 
 
 class Bristles:
@@ -54,7 +50,7 @@ class Bristles:
             level = (level + state.load_friction * np.abs(load)) * (1.0 + state.asymmetry * np.sign(v))
         longest = level / self.bristle + 1e-12
         ratio = self._bend * np.sign(v) / longest
-        slip = np.clip((ratio - ELASTIC_SHARE) / (1.0 - ELASTIC_SHARE), 0.0, 1.0)
+        slip = np.clip((ratio - 0.7) / (1.0 - 0.7), 0.0, 1.0)
         rate = v * (1.0 - slip * slip * (3.0 - 2.0 * slip) * np.abs(ratio))
         self._bend = np.clip(self._bend + self._step * rate, -longest, longest)
         return np.asarray(self.bristle * self._bend + self._bristle_damping * rate + state.viscous * v)
@@ -74,13 +70,11 @@ def servo_targets(law: ServoLaw, command: Array) -> Array:
 def simulate_servos(truth: TrueArm, command: Array, law: ServoLaw) -> Array:
     """Exact readings of the encoders, which are at the motors, of an arm whose servos get a command, at `motion.RATE`
     (K, n) [rad] each."""
-    import mujoco
-
     arm, state = truth.arm, truth.state
     rotor, soft = arm.armature + state.rotor_inertia, state.backlash > 0.0
     model = compile_arm(replace(arm, armature=np.where(soft, 0.0, rotor)))
     data = mujoco.MjData(model)
-    bristles, targets = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), servo_targets(law, command)
+    bristles, targets = Bristles(state, np.maximum(rotor, 0.01), STEP), servo_targets(law, command)
     stiffness = STIFFEST * rotor / STEP**2
     damping, half_play = 2.0 * DAMPING_RATIO * np.sqrt(stiffness * rotor), 0.5 * state.backlash
     spring, rest = state.spring.T
@@ -94,7 +88,7 @@ def simulate_servos(truth: TrueArm, command: Array, law: ServoLaw) -> Array:
         error_sum += error / RATE
         asked = law.stiffness * error - law.damping * speed[1] + law.integral * error_sum
         asked = np.clip(asked, -state.actuator_saturation, state.actuator_saturation)
-        for _ in range(SUBSTEPS):
+        for _ in range(4):
             passed = state.actuator_gain * asked - bristles.force(speed[1], carried)
             if soft.any():
                 twist = turn[1] - turn[0]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Json, reads_recordings
-from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
+from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip, print_table
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
@@ -26,8 +26,6 @@ def compare(
 
     Example: armlink gap compare --sim mine.xml --sim published.xml --heldout run.csv
     """
-    from rich.table import Table
-
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
@@ -51,8 +49,7 @@ def compare(
     out = results(json)
     scale, unit = (1e3, "mrad") if found.unit == "rad" else (1.0, found.unit)
     title = f"gap in {found.count} windows, RMS in {unit}"
-    table = Table("model", "all joints", "95 % interval", *found.names, title=title)
-    alone = len({Path(name).name for name in sim}) == len(sim)
+    rows, alone = [], len({Path(name).name for name in sim}) == len(sim)
     for each in found.models:
         value, low, high = (scale * x for x in each.overall)
         cells = (
@@ -60,8 +57,8 @@ def compare(
             for j, x in enumerate(each.windows)
         )
         model = Path(each.model).name if alone else each.model
-        table.add_row(model, f"{value:.3g}", f"{low:.3g} to {high:.3g}", *cells)
-    out.print(table)
+        rows.append((model, f"{value:.3g}", f"{low:.3g} to {high:.3g}", *cells))
+    print_table(out, ("model", "all joints", "95 % interval", *found.names), rows, title)
     for model, finding in found.checks:
         out.print(f"{model}: {finding.sentence()}", style="yellow")
     if found.unit == "rad":

@@ -1,5 +1,6 @@
 """Explains the gap between a simulation model and recordings of the real arm."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ from armlink.commands.options import Json, reads_recordings
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
+    from rich.table import Column
 
     from armlink.recording.corrections import Corrections
     from sim_gap.attribution.diagnosis import Diagnosis
@@ -223,28 +225,36 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
 
 
 def show(answer: "Diagnosis", console: "Console") -> None:
-    from rich.table import Column, Table
+    from rich.table import Column
 
     from sim_gap.report.effect_text import parameter_rows
 
-    if answer.causes:
-        effect = Column("effect", no_wrap=True)
-        headers = "joints", "RMS before", "after", "confidence", "confounded with"
-        table = Table(effect, *headers, title="causes, on held-out data")
-        for cause in answer.causes:
-            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
-            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
-            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
-        console.print(table)
-        columns = "joint", "parameter", "value", Column("95 % interval", no_wrap=True), "unit"
-        table = Table(Column("effect", no_wrap=True), *columns, title="their parameters")
-        for row in (row for cause in answer.causes for row in parameter_rows(cause)):
-            table.add_row(*row)
-        console.print(table)
-    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
-    for j, name in enumerate(answer.names):
-        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
-        table.add_row(name, *(f"{value:.3g}" for value in numbers))
-    console.print(table)
+    rows = []
+    for cause in answer.causes:
+        joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
+        numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
+        rows.append((cause.effect, joints, *numbers, ", ".join(cause.confounded_with)))
+    if rows:
+        of_cause = Column("effect", no_wrap=True), "joints", "RMS before", "after", "confidence", "confounded with"
+        print_table(console, of_cause, rows, "causes, on held-out data")
+        effect, interval = (Column(name, no_wrap=True) for name in ("effect", "95 % interval"))
+        of_parameter = effect, "joint", "parameter", "value", interval, "unit"
+        parameters = (row for cause in answer.causes for row in parameter_rows(cause))
+        print_table(console, of_parameter, parameters, "their parameters")
+    values = zip(answer.noise_floor, answer.heldout_before, answer.heldout_after, strict=True)
+    gaps = ((name, *(f"{x:.3g}" for x in each)) for name, each in zip(answer.names, values, strict=True))
+    title = f"gap on {answer.heldout_is}, RMS in {answer.unit}"
+    print_table(console, ("joint", "noise floor", "before", "after"), gaps, title)
     for note in answer.notes:
         console.print(note, style="yellow")
+
+
+def print_table(
+    console: "Console", header: "Sequence[str | Column]", rows: Iterable[Sequence[str]], title: str | None = None
+) -> None:
+    from rich.table import Table
+
+    table = Table(*header, title=title)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)

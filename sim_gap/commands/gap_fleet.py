@@ -1,16 +1,20 @@
 """Diagnoses the recordings of a fleet on a cluster of workers, and those of one arm in turn."""
 
+from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
+from statistics import median_high
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from armlink.commands.options import Json, reads_recordings
 from armlink.commands.output import write_json
-from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
+from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip, print_table
 
 if TYPE_CHECKING:
     from armlink.recording.corrections import Corrections
+    from sim_gap.fleet import Answers, CaseOptions
 
 
 @reads_recordings
@@ -48,37 +52,32 @@ def diagnose_fleet(
 
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.extras import require_extra
+    from sim_gap import fleet
     from sim_gap.better_model.training_files import write_parquet
-    from sim_gap.fleet import Answers, CaseOptions, cluster, diagnose_fleet, find_cases, open_to_all
-    from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
-    from sim_gap.trends import rows as rows_of
 
     require_extra("diagnose-fleet", "cluster")
     if table is not None:
         require_extra("--table", "parquet")
-    options = CaseOptions(stated, gains, base, tip)
-    cases = find_cases(folder, sim)
-    answers = Answers(out or folder / "answers.jsonl", options)
+    options = fleet.CaseOptions(stated, gains, base, tip)
+    cases = fleet.find_cases(folder, sim)
+    answers, console = _open_answers(out or folder / "answers.jsonl", options), PlainConsole()
     left = [case for case in cases if case.name not in answers.found]
-    console = PlainConsole()
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
-    _say_other_options(answers, console)
-    if left and open_to_all(scheduler):
-        console.print(open_to_all(scheduler), style="yellow")
+    if left and (warning := fleet.open_to_all(scheduler)):
+        console.print(warning, style="yellow")
     if left:
-        with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
+        with fleet.cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
             task = bars.add_task("diagnosing", total=len(left))
-            for name, answer in diagnose_fleet(left, client, options):
+            for name, answer in fleet.diagnose_fleet(left, client, options):
                 answers.add(name, answer)
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
-    rows = table_of(found)
-    out_console = results(json)
+    rows, out_console = fleet.table(found), results(json)
     _show(rows, out_console)
-    trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
+    trends, outliers = ([asdict(each) for each in every] for every in (fleet_trends(found), fleet_outliers(found)))
     show_changes(trends, outliers, out_console)
     failed = sum("error" in answer for answer in found.values())
     out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
@@ -89,35 +88,24 @@ def diagnose_fleet(
 
 
 def _show(rows: list[dict[str, Any]], console: Any) -> None:
-    from rich.table import Table
-
     cases = {row["case"]: row["verdict"] for row in rows}
-    verdicts = ", ".join(f"{list(cases.values()).count(v)} {v}" for v in sorted(set(cases.values())))
-    shown = Table("effect", "arms", "cases", "median shrink", title=f"{len(cases)} cases: {verdicts}")
-    effects = sorted({row["effect"] for row in rows if row["effect"]})
-    counts = {e: [row for row in rows if row["effect"] == e] for e in effects}
-    for effect in sorted(effects, key=lambda e: -len(counts[e])):
-        shrinks = sorted(row["shrink"] or 0.0 for row in counts[effect])
-        arms = str(len({row["arm"] for row in counts[effect]}))
-        shown.add_row(
-            effect, arms, str(len({row["case"] for row in counts[effect]})), f"{shrinks[len(shrinks) // 2]:.2f}"
-        )
-    console.print(shown)
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(Counter(cases.values()).items()))
+    shown, effects = [], Counter(sorted(row["effect"] for row in rows if row["effect"]))
+    for effect, _ in effects.most_common():
+        own = [row for row in rows if row["effect"] == effect]
+        counts = (str(len({row[key] for row in own})) for key in ("arm", "case"))
+        shown.append((effect, *counts, f"{median_high(row['shrink'] or 0.0 for row in own):.2f}"))
+    print_table(console, ("effect", "arms", "cases", "median shrink"), shown, f"{len(cases)} cases: {verdicts}")
     for row in rows:
         if row["error"]:
             console.print(f"{row['case']}: {row['error']}", style="yellow")
 
 
 def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
-    from rich.table import Table
-
     if trends:
-        shown = Table("arm", "effect", "joint", "parameter", "before", "now", "since", "noticed", title="what changes")
-        for one in trends:
-            values = (f"{one['before']:.3g}", f"{one['now']:.3g} {one['unit']}")
-            names = (one["arm"], one["effect"], one["joint"], one["parameter"])
-            shown.add_row(*names, *values, one["since"], one["noticed"])
-        console.print(shown)
+        header = ("arm", "effect", "joint", "parameter", "before", "now", "since", "noticed")
+        texts = [x | {"before": f"{x['before']:.3g}", "now": f"{x['now']:.3g} {x['unit']}"} for x in trends]
+        print_table(console, header, [[each[name] for name in header] for each in texts], "what changes")
     for one in outliers:
         console.print(
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} is {one['value']:.3g} "
@@ -147,24 +135,23 @@ def trend(
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
-    from armlink.commands.plain_console import PlainConsole, results
-    from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
+    from armlink.commands.plain_console import results
+    from sim_gap import fleet
     from sim_gap.model.load import load_compiled
-    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings, rows
+    from sim_gap.trends import UNDATED, date_of, fleet_trends, needed_recordings
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json)
-    options = CaseOptions(stated, gains, base, tip)
-    answers = Answers(out or folder / "answers.jsonl", options)
-    _say_other_options(answers, PlainConsole())
+    options = fleet.CaseOptions(stated, gains, base, tip)
+    answers = _open_answers(out or folder / "answers.jsonl", options)
     newest = ""
-    for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
+    for case in sorted(fleet.find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
         if newest not in answers.found:
-            answers.add(newest, diagnose_case(case, options))
+            answers.add(newest, fleet.diagnose_case(case, options))
         answer = answers.found[newest]
         console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
-    trends = rows(fleet_trends(answers.found))
+    trends = [asdict(each) for each in fleet_trends(answers.found)]
     show_changes(trends, [], console)
     changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
     console.print(f"{_count(len(answers.found), 'recording')}: {needed_recordings(answers.found) or changes}")
@@ -174,13 +161,16 @@ def trend(
     return int("error" in newest_answer)
 
 
-def _say_other_options(answers: Any, console: Any) -> None:
-    if answers.of_other_options:
-        made = "was made" if answers.of_other_options == 1 else "were made"
-        console.print(
-            f"{answers.path}: {_count(answers.of_other_options, 'answer')} {made} with other options; they "
-            "stay in the file, but are not used"
-        )
+def _open_answers(path: Path, options: "CaseOptions") -> "Answers":
+    """The answers in a file; those that were made with other options are told."""
+    from armlink.commands.plain_console import PlainConsole
+    from sim_gap.fleet import Answers
+
+    answers = Answers(path, options)
+    if number := answers.of_other_options:
+        made = f"{_count(number, 'answer')} {'was' if number == 1 else 'were'} made with other options"
+        PlainConsole().print(f"{path}: {made}; they stay in the file, but are not used")
+    return answers
 
 
 def _count(number: int, noun: str) -> str:

@@ -45,9 +45,7 @@ def plan(
         console.print(piece)
     console.print(f"{out}: {motion.seconds:.0f} s of motion")
     suggest(command_line("gap", "collect", arm, motion=out, out=out.with_suffix(".mcap")))
-    write_json(
-        json, {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences}
-    )
+    write_json(json, {"file": str(out), "seconds": motion.seconds, "pieces": motion.pieces, "asked_for": sentences})
     return 0
 
 

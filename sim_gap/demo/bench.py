@@ -25,7 +25,7 @@ from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
-from sim_gap.experiment import ACCELERATION, multisine
+from sim_gap.experiment import MOVES, multisine
 
 TONES, TONE_BAND_HZ = 3, (0.08, 0.3)
 """Number of sines per joint in the recorded motion, and their frequencies [Hz]."""
@@ -47,7 +47,7 @@ class Bench:
 
     def travel(self, start: Array, goal: Array) -> None:
         """Bring all joints under position control from `start` to `goal` (n,) [rad]."""
-        for target in trajectory(start, goal, self.speed, np.full(len(goal), ACCELERATION), self.link.period):
+        for target in trajectory(start, goal, self.speed, np.full(len(goal), MOVES.acceleration), self.link.period):
             self.link.cycle(Command.hold(target))
 
     def sensor_error(self, joint: int) -> tuple[float, float]:

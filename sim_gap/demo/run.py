@@ -1,30 +1,28 @@
 """Runs the demo: each step is a call of the product; the demo's own are the hidden truth, the operator, the order."""
 
-import os
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
-from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from threading import Thread
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
+from rich.text import Text
 
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile
-from armlink.commands.plain_console import command_line, suggest
+from armlink.commands.output import write_json
+from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
 from armlink.content.atomic_file import writing
+from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
+from calib.commands.screen import SweepScreen, print_intervals
 from calib.commissioning.draft import assumed_lines
 from calib.commissioning.model_checks import refuse_impossible_sweep
 from calib.commissioning.new_arm import new_arm
@@ -42,20 +40,21 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.report import calibration
 from calib.report.figures import verify_figure, watch_figure
-from calib.report.page import ReportSection, paragraph
+from calib.report.page import ReportSection, bullets, paragraph, render
+from calib.report.tables import ReportTable, interval_table
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
-from sim_gap.demo.account import Account
+from sim_gap.attribution.diagnosis import plain_json
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
-from sim_gap.model.load import compile_model
+from sim_gap.model.load import load_compiled
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 
-Made = TypeVar("Made")
 BY = "armlink demo"
+OPENED = "The fit saw only what came over the bus. The true values were opened only after everything was estimated."
 SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
@@ -63,8 +62,6 @@ DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
 """Factor on the sensor's readings; offset added to them [N·m], at most this share of rated torque."""
 QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 """Ordinary work before the drift begins, at most, and after a recalibration [s]."""
-SLOW_SETTLING = 0.5
-"""A joint under MIT gains settles so much later [s]: its host's integral term has to forget the torque of braking."""
 WATCHED = (
     "At every stop the observer compares gravity and sensors. Estimates are relative to the calibration that "
     "was current at that time."
@@ -95,6 +92,49 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     suggest(real if Path(arm_name).suffix else "armlink new MODEL.urdf")
 
 
+class Account:
+    """The demo's account of itself: lines in the terminal, `summary.json` (schema armlink.demo/1), and the page."""
+
+    def __init__(self, json_path: Path | None) -> None:
+        self.summary: dict[str, Any] = {}
+        self.sections: list[ReportSection] = []
+        self._findings, self.began = list[str](), time.monotonic()
+        self._json, self._results, self._console = json_path, results(json_path), PlainConsole()
+
+    def say(self, text: str, style: str = "", console: PlainConsole | None = None) -> None:
+        line = Text.assemble((f"{time.monotonic() - self.began:5.0f} s", "dim"), "  ", (printable_text(text), style))
+        (console or self._console).print(line)
+
+    @contextmanager
+    def stage(self, headline: str) -> Iterator[SweepScreen]:
+        self.say(headline, "bold")
+        with SweepScreen("") as screen:
+            yield screen
+
+    def find(self, text: str) -> None:
+        """A result in a sentence, without a full stop."""
+        self._findings.append(f"{text}.")
+        self.say(text, console=self._results)
+
+    def table(self, title: str, names: tuple[str, ...], columns: Mapping[str, tuple[Array, Array]]) -> ReportTable:
+        """Print a table; returns it for a section. `columns` maps heading to (value, half of its 95 % interval)."""
+        print_intervals(title, names, dict(columns), self._results)
+        return interval_table(names, columns, f"{title}.")
+
+    def note(self, **values: Any) -> None:
+        """Add to the summary: numbers with seven digits, null where one is not finite."""
+        self.summary |= plain_json(values, digits=7)
+
+    def write(self, out: Path, subtitle: str) -> None:
+        """Write `report.html` and `summary.json`; raises OSError."""
+        short = ReportSection("In short", paragraph(OPENED) + bullets(self._findings))
+        render(out / "report.html", "armlink demo", [short, *self.sections], subtitle)
+        summary = {"schema": "armlink.demo/1", **self.summary}
+        for path in (out / "summary.json", self._json):
+            write_json(path, summary)
+        self.say(f"done: open {out / 'report.html'}; the numbers are in {out / 'summary.json'}", console=self._results)
+
+
 def quick(arm: ArmFile) -> ArmFile:
     """The arm with the demo's creeps, where it creeps and its file states none."""
     section = sweep_section(arm)
@@ -113,41 +153,6 @@ def _fresh(out: Path) -> Path:
         data.mkdir(parents=True)
         (data / ".armlink-demo").touch()
     return data
-
-
-@contextmanager
-def beside(work: Callable[..., Made], *given: Any, **options: Any) -> Iterator[Callable[[], Made]]:
-    """A call that returns what `work`, a module's function, makes of what is given, or raises as it does.
-
-    A process of its own works from now on, where there is a core for it; else the work is done in the call. It ends
-    with the context: where this process gives up, nobody waits for the other.
-    """
-    whole = partial(work, *given, **options)
-    if len(os.sched_getaffinity(0)) < 2:
-        yield whole
-        return
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_follow_parent) as pool:
-        others = active_children()
-        job = pool.submit(whole)
-        try:
-            yield job.result
-        finally:
-            for worker in active_children():
-                if worker not in others:
-                    worker.terminate()
-
-
-def _follow_parent() -> None:
-    """Leave Ctrl-C to the parent, which then ends this process, and end with it if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def last_word(history: WatchHistory, after: float) -> str:
@@ -190,13 +195,13 @@ class Demo:
             if plan is not None:
                 sags |= self._sag(plan, "calibrated", gravity.beta, record.values("position_offset", 0.0))
                 account.note(sag={"poses": len(sag_poses(plan)), **sags})
-            with beside(diagnose, compile_model(arm.path), *recordings) as diagnosed:
-                self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
-                if not bench.creeping:
-                    self._drift(record, model, check)
-                account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-                gap, bus = diagnosed(), link.stats
+            self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
+            if not bench.creeping:
+                self._drift(record, model, check)
+            bus = link.stats
             link.disable()
+        account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
+        gap = diagnose(load_compiled(arm.path), *recordings)
         self.store.close()
         account.find(sentence(gap))
         account.sections += gap_sections(gap)
@@ -257,7 +262,8 @@ class Demo:
         name, offset = link.names[joint], min(DRIFT_OFFSET, DRIFT_OFFSET_SHARE * section.joints[joint].rated_torque)
         limits = described.lower, described.upper, np.array([each.max_velocity for each in section.joints])
         own_integral = all(setup.gains is None for setup in link.setups)
-        motion = WorkMotion() if own_integral else WorkMotion(rest=WorkMotion.rest + SLOW_SETTLING)
+        # a joint under MIT gains settles later: its host's integral term has to forget the torque of braking
+        motion = WorkMotion() if own_integral else WorkMotion(rest=WorkMotion.rest + 0.5)
         targets = work_targets(link.position_sent, *limits, link.period, np.random.default_rng([self.seed, 8]), motion)
         start, began, before = np.nan, np.inf, (0.0, 0.0)
 

@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import add_actuator, compile_spec, is_urdf, read_model
 from gcomp.arm.inertials import fixed_body_parameters
-from gcomp.arm.model_file import HAND, coupled_joints, linear_part, upwards
+from gcomp.arm.model_file import HAND, coupled_joints, linear_part, links_of_bodies, upwards
 from gcomp.arm.rigid_body import RigidArm, Tendons
 from gcomp.arrays import Array
+from sim_bus.effects.state import Imperfections
+from sim_bus.physics.mjcf import build_model
 from sim_gap.model.solver_friction import creep_speeds
 
 
@@ -59,8 +62,6 @@ def parse_known_gains(text: str) -> KnownGains | None:
 
 def put_gains(spec: Any, joints: Sequence[int], gains: KnownGains) -> None:
     """Give joints of a compiled `mujoco.MjSpec` position actuators with these gains in place of what drives them."""
-    import mujoco
-
     for j, joint in enumerate(joints):
         name = spec.joints[joint].name
         old = [a for a in spec.actuators if a.target == name and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
@@ -97,9 +98,6 @@ def nominal_model(path: Path) -> Any:
     if arm.model_path is not None and not (isinstance(arm.sim, dict) and arm.sim.get("links")):
         return arm.model_path
     if arm.sim is not None:
-        from sim_bus.effects.state import Imperfections
-        from sim_bus.physics.mjcf import build_model
-
         spec = build_model(arm, Imperfections(arm.joint_names)).spec
         for joint in spec.joints:
             joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
@@ -108,8 +106,6 @@ def nominal_model(path: Path) -> Any:
 
 
 def hinges_of(model: Any) -> dict[str, int]:
-    import mujoco
-
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
     return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in hinges}
 
@@ -159,8 +155,6 @@ def arm_hinges(model: Any, hinges: dict[str, int], label: str) -> dict[str, int]
 
 
 def _body(model: Any, name: str, option: str) -> int:
-    import mujoco
-
     body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
     if body < 0:
         names = ", ".join(model.body(each).name for each in range(1, model.nbody))
@@ -253,13 +247,8 @@ def named_spec(sim: SimModel) -> Any:
 
 
 def load_compiled(source: Any) -> Any:
-    """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
-    return compile_model(Path(source)) if isinstance(source, str | Path) else source
-
-
-def compile_model(path: Path) -> Any:
-    """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
-    return compile_spec(read_spec(path), path)
+    """The `mujoco.MjModel` of an MJCF, URDF or arm file, by path or bundled name, or the one given. Raises BadInput."""
+    return compile_spec(read_spec(Path(source)), Path(source)) if isinstance(source, str | Path) else source
 
 
 def read_spec(path: Path) -> Any:
@@ -282,19 +271,11 @@ def urdf_behind(path: Path | None) -> Path | None:
     return source if isinstance(source, Path) and is_urdf(source) else None
 
 
-def links_of_bodies(model: Any, joints: Sequence[int]) -> list[int]:
-    """The link, of those that the joints move, that each body belongs to; −1 for one that none carries."""
-    moved = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
-    return [next((moved[up] for up in upwards(model, body) if up in moved), -1) for body in range(model.nbody)]
-
-
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
     """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
 
     Other joints of the model are locked at qpos0; bodies on them belong to the link that carries them.
     """
-    import mujoco
-
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -332,8 +313,6 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
 
 def tendons_of(model: Any, joints: Sequence[int]) -> Tendons:
     """The fixed tendons of a compiled model over its joints `joints`; spatial tendons are left out."""
-    import mujoco
-
     rows, which = [], []
     for tendon in range(model.ntendon):
         wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
@@ -356,8 +335,6 @@ def tendons_of(model: Any, joints: Sequence[int]) -> Tendons:
 
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
     """Compare with mj_inverse at random states. Raises BadInput for a model with parts that the chain leaves out."""
-    import mujoco
-
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     adr, dof = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
     bits = mujoco.mjtDisableBit
@@ -392,8 +369,6 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
 @contextmanager
 def silent() -> Iterator[None]:
     """MuJoCo writes no log of the simulations that break loose."""
-    import mujoco
-
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: None)
     try:

@@ -8,6 +8,7 @@ D = d/((1 − d)·w), where d is the impedance (first of `solimpfriction`), w th
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from gcomp.arrays import Array
@@ -20,8 +21,6 @@ TIME_S = 0.01
 
 def creep_speeds(model: Any, dofs: Sequence[int]) -> Array:
     """Speed below which each degree of freedom creeps under less than its friction loss [rad/s], (n,); 0 without."""
-    import mujoco
-
     rows = list(dofs)
     least, most = (np.clip(model.dof_solimp[rows, k], mujoco.mjMINIMP, mujoco.mjMAXIMP) for k in range(2))
     first, second = model.dof_solref[rows, 0], model.dof_solref[rows, 1]
@@ -36,9 +35,7 @@ def solver_parameters(friction: float, speed: float, inverse_inertia: float) -> 
 
     `inverse_inertia` is the model's `dof_invweight0` [1/(kg·m²)].
     """
-    from mujoco import mjMAXIMP, mjMINIMP
-
-    damping = 2.0 / (TIME_S * mjMAXIMP)
+    damping = 2.0 / (TIME_S * mujoco.mjMAXIMP)
     wanted = friction / (speed * damping) * inverse_inertia if speed > 0.0 else np.inf
     impedance = min(wanted / (1.0 + wanted), STIFFEST) if np.isfinite(wanted) else STIFFEST
-    return [TIME_S, 1.0], [max(impedance, mjMINIMP), mjMAXIMP, 0.001, 0.5, 2.0]
+    return [TIME_S, 1.0], [max(impedance, mujoco.mjMINIMP), mujoco.mjMAXIMP, 0.001, 0.5, 2.0]

@@ -1,7 +1,8 @@
 """The diagnosis as sections of a report: verdict, causes, gap before and after, figures of the residuals."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportSection as Section
@@ -28,15 +29,52 @@ PARAMETERS = {
     ),
 }
 """Meaning of the parameters of a diagnosis, by the unit of its gap."""
+MOTION = (
+    "The command, the measured motion, and free-running simulations along the command, on held-out data. Click a "
+    "name to hide or show its curve; “without” leaves one effect out of the corrected model."
+)
 
 
 def sections(answer: Diagnosis) -> list[Section]:
     out = [_verdict(answer), _gap(answer)]
     if isinstance(answer.internals, Identified):
-        out += _motion(answer.internals, answer.causes)
-    elif answer.internals is not None:
-        out += [*_over_time(answer), *_causes(answer), *_laws(answer), *_residuals(answer)]
-    return out
+        shown = {"Motion of every joint": (MOTION, [motion_figure(answer.internals, answer.causes)])}
+        return out + _sections_of(shown)
+    if answer.internals is None:
+        return out
+    layout = answer.internals.heldout.layout
+    for channel in reversed(layout.chain):
+        model = channel == layout.against_model
+        nominal = "prediction of the nominal model" if model else "prediction from the readings of the torque sensor"
+        words = CHANNEL_WORDS[channel]
+        text = (
+            f"The {words} of every joint on held-out data: the measurement, the {nominal}, and the "
+            "prediction with the causes added. Click a name to hide or show its curve; “without” leaves one effect out."
+        )
+        out += _sections_of({f"Every joint over time: {words}": (text, [torque_over_time(answer, channel)])})
+    return [*out, *_sections_of(_parts_of_causes(answer)), *_residuals(answer)]
+
+
+def _sections_of(parts: Mapping[str, tuple[str, Sequence[Any]]]) -> list[Section]:
+    """A section with a title, a text and figures of each part that has a figure."""
+    figures = {title: [figure for figure in made if figure is not None] for title, (_, made) in parts.items()}
+    return [Section(title, paragraph(text), figures[title]) for title, (text, _) in parts.items() if figures[title]]
+
+
+def _parts_of_causes(answer: Diagnosis) -> dict[str, tuple[str, Sequence[Any]]]:
+    return {
+        "The causes one by one": (
+            "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual minus "
+            "all other causes, orange is the contribution of this cause. A correct cause follows the centre of the "
+            "grey points.",
+            [cause_figure(answer, cause) for cause in answer.causes],
+        ),
+        "Laws without a known cause": (
+            "Here the part of the torque that no known effect explains follows one quantity of the joint. The law was "
+            "fitted to the training data; grey points are held-out data. The law says how the torque varies, not why.",
+            [law_figure(answer, law) for law in answer.laws],
+        ),
+    }
 
 
 def write_report(answer: Diagnosis, path: Path, subtitle: str = "") -> None:
@@ -100,78 +138,21 @@ def _gap(answer: Diagnosis) -> Section:
     return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
 
 
-def _motion(found: Identified, causes: Sequence[Cause]) -> list[Section]:
-    figure = motion_figure(found, causes)
-    text = (
-        "The command, the measured motion, and free-running simulations along the command, on held-out data. Click a "
-        "name to hide or show its curve; “without” leaves one effect out of the corrected model."
-    )
-    return [] if figure is None else [Section("Motion of every joint", paragraph(text), [figure])]
-
-
-def _over_time(answer: Diagnosis) -> list[Section]:
-    layout, out = answer.internals.heldout.layout, []
-    for channel in reversed(layout.chain):
-        nominal = (
-            "the prediction of the nominal model"
-            if channel == layout.against_model
-            else "the prediction from the readings of the torque sensor"
-        )
-        text = (
-            f"The {CHANNEL_WORDS[channel]} of every joint on held-out data: the measurement, {nominal}, and the "
-            "prediction with the causes added. Click a name to hide or show its curve; “without” leaves one effect out."
-        )
-        figure = torque_over_time(answer, channel)
-        if figure is not None:
-            out.append(Section(f"Every joint over time: {CHANNEL_WORDS[channel]}", paragraph(text), [figure]))
-    return out
-
-
-def _causes(answer: Diagnosis) -> list[Section]:
-    figures = [cause_figure(answer, cause) for cause in answer.causes]
-    shown = [figure for figure in figures if figure is not None]
-    if not shown:
-        return []
-    text = (
-        "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual minus all "
-        "other causes, orange is the contribution of this cause. A correct cause follows the centre of the grey points."
-    )
-    return [Section("The causes one by one", paragraph(text), shown)]
-
-
-def _laws(answer: Diagnosis) -> list[Section]:
-    if not answer.laws:
-        return []
-    text = (
-        "Here the part of the torque that no known effect explains follows one quantity of "
-        "the joint. The law was fitted to the training data; grey points are held-out data. The law says "
-        "how the torque varies, not why."
-    )
-    return [Section("Laws without a known cause", paragraph(text), [law_figure(answer, law) for law in answer.laws])]
-
-
 def _residuals(answer: Diagnosis) -> list[Section]:
     locations = {(at.channel, at.joint): at for at in answer.where}
-    data = answer.internals.heldout
-    out = []
-    for channel in reversed(data.layout.chain):
-        against = "the model" if channel == data.layout.against_model else "the torque sensor"
-        rows = [
-            [name, at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"]
-            for name in answer.names
-            if (at := locations.get((channel, name))) is not None
-        ]
-        header = ("joint", "correlates with", "share", "RMS [N·m]", "noise [N·m]")
-        words = CHANNEL_WORDS[channel]
+    header = ("joint", "correlates with", "share", "RMS [N·m]", "noise [N·m]")
+    caption = "For each residual, the regime of motion with the largest share of its mean square."
+    layout, out = answer.internals.heldout.layout, []
+    for channel in reversed(layout.chain):
+        here = ((name, locations.get((channel, name))) for name in answer.names)
+        rows = [[name, at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"] for name, at in here if at]
+        figure, words = residual_panels(answer, channel), CHANNEL_WORDS[channel]
+        against = "the model" if channel == layout.against_model else "the torque sensor"
         text = (
             f"The {words} minus the prediction of {against} on held-out data: grey is the measurement, orange is "
             "the sum of the causes."
         )
-        table = ReportTable(
-            header, rows, "For each residual, the regime of motion with the largest share of its mean square.", texts=2
-        )
-        figure = residual_panels(answer, channel)
-        out.append(
-            Section(f"Residuals of the {words}", paragraph(text), [figure] if figure is not None else [], [table])
-        )
+        figures = [] if figure is None else [figure]
+        table = ReportTable(header, rows, caption, texts=2)
+        out.append(Section(f"Residuals of the {words}", paragraph(text), figures, [table]))
     return out

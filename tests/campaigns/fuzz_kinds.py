@@ -38,7 +38,7 @@ from armlink.errors import ArmlinkError, BadInput
 from armlink.guard.bus_guard import Policy, PolicyError
 from armlink.link.joints.groups import make_groups
 from armlink.model_file import compile_model
-from armlink.recording.csv_text import load_poses
+from armlink.recording.csv_text import load_columns
 from armlink.recording.files import load_recordings, save_recording
 from armlink.recording.recording import Recording
 from armlink.recording.replay import recording_of_log
@@ -155,7 +155,7 @@ def motions(folder: Path) -> list[Seed]:
 
 
 def load_a_motion(path: Path) -> None:
-    load_poses(path, 3)
+    load_columns(path, ["q_1", "q_2", "q_3"])
     load_motion(path, load_arm(ROOT / "examples" / "planar3.yaml"))
 
 
@@ -331,11 +331,11 @@ def answers(_: Path) -> list[Seed]:
 
 def read_answers(path: Path) -> None:
     from sim_gap.fleet import table
-    from sim_gap.trends import fleet_trends, rows
+    from sim_gap.trends import fleet_trends
 
     found = Answers(path).found
     table(found)
-    rows(fleet_trends(found))
+    fleet_trends(found)
 
 
 KINDS = {

@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from armlink.arm_file import read_yaml
 from armlink.errors import BadInput
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
@@ -24,8 +25,8 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.attribution.residual_laws import as_effects
 from sim_gap.better_model.export import HELD, write_model
-from sim_gap.blind.bench import make_apart
-from sim_gap.blind.real_recordings import KNOWN, read_cases, recordings_of
+from sim_gap.blind.bench import make_cases
+from sim_gap.blind.real_recordings import KNOWN, recordings_of
 
 MOST = 0.05
 """Largest change of a parameter, as a share of it."""
@@ -92,13 +93,13 @@ def twice(case: Case, folder: Path) -> tuple[bool, str]:
 
 
 def real_cases(folder: Path, only: str) -> Iterator[Case]:
-    for case in read_cases(KNOWN):
+    for case in read_yaml(KNOWN):
         if only in case["case"] and (folder / case["sim"]).is_file():
             yield case["case"], folder / case["sim"], *recordings_of(folder, case)
 
 
 def bench_cases(folder: Path, seed: int, cases: int, effects: str) -> Iterator[Case]:
-    for _ in make_apart(folder, seed=seed, cases=cases, workers=1, lengths=LENGTHS, effects=effects):
+    for _ in make_cases(folder, seed, cases, 1, LENGTHS, effects):
         pass
     for path in sorted((folder / "cases").iterdir()):
         train, heldout = ([load_recording(path / f"{each}.csv")] for each in ("train", "heldout"))

@@ -20,8 +20,7 @@ from scipy.special import expit
 from sim_gap.attribution.diagnosis import Signs
 from sim_gap.attribution.verdict import features
 from sim_gap.blind.bench import open_labels
-from sim_gap.blind.judge import judge
-from sim_gap.blind.score import BINS, WITHHELD
+from sim_gap.blind.score import BINS, WITHHELD, judge
 
 RIDGE = 0.01
 """Strength of the pull towards no influence, per answer and squared influence of a feature's spread."""

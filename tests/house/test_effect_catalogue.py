@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from armlink.effect_catalogue import CATALOGUE
@@ -10,8 +11,10 @@ from calib.fit import unmodelled_effects
 from calib.observer.cause_test import CAUSES
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
-from sim_gap.blind.effects import DRAWS, NOT_DRAWN
-from sim_gap.blind.effects.drawn_effect import DrawnEffect
+from sim_gap.blind.arms import draw_arm
+from sim_gap.blind.effects import DRAWS
+from sim_gap.blind.motion import MotionLimits, trajectory
+from sim_gap.blind.scene import Scene
 from sim_gap.effects.registry import NOT_DIAGNOSED, effects, library_without
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -19,7 +22,7 @@ ID = re.compile(r"`([a-z]+\.[a-z_]+)`")
 FORMS = {
     "forward": (set(forward_effects()), NOT_SIMULATED),
     "inverse": (set(library_without([])), NOT_DIAGNOSED),
-    "blind": (set(DRAWS), NOT_DRAWN),
+    "blind": (set(DRAWS), NOT_SIMULATED),
 }
 
 
@@ -53,9 +56,18 @@ def test_the_forms_share_parameters_and_units() -> None:
         assert effects()[effect_id].signature.whole_arm is CATALOGUE[effect_id].whole_arm
 
 
-def test_a_blind_effect_with_a_parameter_outside_the_catalogue_is_refused() -> None:
-    with pytest.raises(ValueError, match="strength not in the catalogue"):
-        DrawnEffect("friction.coulomb", {"joint_1": {"strength": 1.0}})
+def test_the_blind_effects_have_parameters_of_the_catalogue() -> None:
+    random, drawn = np.random.default_rng(1), set()
+    for _ in range(2):
+        arm = draw_arm(random, 5)
+        limits = MotionLimits(arm.lower, arm.upper, np.full(5, 1.5), np.full(5, 5.0))
+        scene = Scene(arm, trajectory(("points", "sines"), 10.0, limits, random))
+        found = [each for draw in DRAWS.values() if (each := draw(scene, random)) is not None]
+        for each in found:
+            names = {name for values in each.parameters.values() for name in values}
+            assert names <= {name for name, _ in CATALOGUE[each.effect].reported}, each.effect
+        drawn |= {each.effect for each in found}
+    assert len(drawn) > 0.5 * len(DRAWS)
 
 
 def test_the_sensor_fit_and_the_cause_test_use_its_ids() -> None:

@@ -12,10 +12,10 @@ from armlink.link.link import Link
 from armlink.recording.files import load_recording
 from calib.arm.kinematics import gcomp_arm
 from sim_gap.experiment import (
-    ACCELERATION,
     LONGEST,
+    MOVES,
     SPEEDS,
-    _Shape,
+    PlannedMotion,
     collect,
     joints_in_doubt,
     load_motion,
@@ -52,7 +52,7 @@ def test_each_joint_turns_both_ways_at_every_speed_alone() -> None:
 
 def test_a_slow_joint_turns_through_a_part_of_its_range() -> None:
     """As far as it gets in the longest time, about the middle."""
-    shape = _Shape(load_arm("sarcos"))
+    shape = PlannedMotion(load_arm("sarcos"))
     shape.fastest = 0.004 * (shape.high - shape.low)
     shape.turn(3, shape.here)
     q = np.concatenate(shape.rows)[:, 3]
@@ -101,8 +101,8 @@ def test_a_motion_that_does_not_fit_the_arm_is_refused(tmp_path: Path) -> None:
     for name, bad, words in (
         ("beyond", beyond, "joint_3 goes from .* beyond its range"),
         ("fast", fast, "joint_5 turns at .* but its max_velocity"),
-        ("missing", missing, "row 8: q_cmd_2 has no value"),
-        ("narrow", rows[:, :5], "column q_cmd_6, q_cmd_7 is missing"),
+        ("missing", missing, "row 8: q_cmd_2 is nan, expected a number"),
+        ("narrow", rows[:, :5], "column q_cmd_6 is missing"),
     ):
         with pytest.raises(BadInput, match=words):
             load_motion(write(tmp_path / f"{name}.csv", bad), arm)
@@ -140,11 +140,11 @@ def test_sines_keep_reach_speed_and_acceleration() -> None:
     q, v, a = waves((0.35, 0.9), (0.12, 4.8), 1)
     assert (np.abs(q) <= [0.35 + 1e-9, 0.9 + 1e-9]).all()
     assert (np.abs(v) <= [0.12 + 1e-6, 4.8 + 1e-6]).all()
-    assert np.abs(a).max() <= ACCELERATION + 1e-6
+    assert np.abs(a).max() <= MOVES.acceleration + 1e-6
     assert (np.ptp(q, axis=0) > 0.05).all()
 
 
 def test_sines_use_the_acceleration_that_they_may() -> None:
     """On a joint with reach and speed in plenty; where the sines meet, in the course of a minute."""
     _, _, a = waves((0.35, 30.0), (0.6, 30.0), 3)
-    assert 0.95 * ACCELERATION < np.abs(a[:, 1]).max() <= ACCELERATION + 1e-6
+    assert 0.95 * MOVES.acceleration < np.abs(a[:, 1]).max() <= MOVES.acceleration + 1e-6

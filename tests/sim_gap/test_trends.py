@@ -5,7 +5,7 @@ from datetime import date, timedelta
 import numpy as np
 import pytest
 
-from sim_gap.trends import CLEAR, _Series, _without_unclear, date_of, fleet_outliers, fleet_trends
+from sim_gap.trends import date_of, fleet_outliers, fleet_trends
 
 DAYS, ARMS, BEGINS, WEARS = 60, 20, 15, 35
 """Days, arms, day at which wear begins, and days over which it takes place."""
@@ -140,11 +140,3 @@ def test_an_arm_that_differs_from_the_fleet_is_named_without_dates():
 def test_the_date_stands_in_the_name(case, expected):
     found = date_of(case)
     assert (None if found is None else (found.year, found.month, found.day, found.hour)) == expected
-
-
-def test_a_day_on_which_a_joint_hardly_moved_is_left_out_of_what_is_watched() -> None:
-    values, half = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.1, 0.11 * CLEAR, 0.1, 0.1])
-    left = _without_unclear(_Series("u", [], values.copy(), half)).values
-    assert np.isnan(left).tolist() == [False, True, False, False]
-    found = _without_unclear(_Series("u", [], values.copy(), np.full(4, np.nan))).values
-    assert found.tolist() == values.tolist()

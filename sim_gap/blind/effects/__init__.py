@@ -1,12 +1,6 @@
-"""The blind form of the effects: magnitudes that show in a recording."""
+"""The blind form of the effects that the simulated arm has: magnitudes that show in a recording."""
 
-from sim_gap.blind.effects import joint, link
-from sim_gap.blind.effects.drawn_effect import Draw
+from sim_gap.blind.effects import arm
 
-DRAWS: dict[str, Draw] = {**link.DRAWS, **joint.DRAWS}
-NOT_DRAWN = {
-    "friction.bearing": "all friction of the simulated arm is between motor and torque sensor",
-    "torque.nonlinearity": "no diagnosis names it, so a case of it could not be scored",
-}
-"""Catalogue ids without a blind form, and why."""
+DRAWS = arm.DRAWS
 EFFECTS = tuple(sorted(DRAWS))

@@ -6,13 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.scene import Scene, ServoLaw
-
-OFTEN_HZ = 0.08
-"""Rate of torque reversals from which effects at a reversal show [Hz]."""
 
 Values = dict[str, float]
 
@@ -44,14 +40,6 @@ class DrawnEffect:
     """Why slow motion may not separate it from another effect; empty if the recording can."""
     confused_with: tuple[str, ...] = ()
     """Effects that are an equally good answer if it is undecided."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a parameter that is not in the catalogue, which has no controllers."""
-        if self.effect not in CATALOGUE and self.effect.startswith("controller."):
-            return
-        known = {name for name, _ in CATALOGUE[self.effect].reported}
-        if unknown := {name for values in self.parameters.values() for name in values} - known:
-            raise ValueError(f"{self.effect}: {', '.join(sorted(unknown))} not in the catalogue")
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -108,7 +96,7 @@ def sign(random: np.random.Generator) -> float:
 
 
 def reverses_often(scene: Scene, width: Array) -> Mask:
-    """Joints whose torque often passes from beyond +width to beyond −width or back, (n,)."""
+    """Joints whose torque passes from beyond +width to beyond −width or back every 12.5 s or more often, (n,)."""
     beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(scene.torque.T, width, strict=True))
     counts = np.array([np.count_nonzero(np.diff(signs)) for signs in beyond])
-    return np.asarray(counts >= OFTEN_HZ * scene.seconds)
+    return np.asarray(counts >= 0.08 * scene.seconds)

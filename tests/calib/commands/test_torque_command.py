@@ -97,7 +97,7 @@ def test_without_inertials_or_record_there_is_no_answer(tmp_path, poses, capsys)
     ("text", "words"),
     [
         ("q_1,q_2\n0,0\n", ["column q_3 is missing"]),
-        ("q_1,q_2,q_3\n", ["no pose"]),
+        ("q_1,q_2,q_3\n", ["no row of values"]),
         ("q_1,q_2,q_3\n0,0,0\n0,wide,0\n", ["row 2", "q_2", "wide"]),
         ("q_1,q_2,q_3\n0,nan,0\n", ["row 1", "q_2", "nan"]),
         ("q_1,q_2,q_3\n0,0\n", ["row 1", "3 columns"]),

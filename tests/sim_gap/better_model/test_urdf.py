@@ -12,7 +12,7 @@ from armlink.errors import BadInput
 from calib.arm.model_files import urdf_of
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.export import write_model
-from sim_gap.model.load import compile_model, urdf_behind
+from sim_gap.model.load import load_compiled, urdf_behind
 
 ROOT = Path(__file__).parents[3]
 TWO_AXES = """<mujoco><worldbody><body name="a" pos="0 0 1" euler="0 30 0"><joint name="x" axis="1 0 0" pos="0 0.1 0"/>
@@ -37,10 +37,10 @@ def torques(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, a: np.ndarray) 
 def test_mujoco_and_pinocchio_get_the_same_torques_from_it(tmp_path, source):
     path = ROOT / source if source else tmp_path / "two.xml"
     (tmp_path / "two.xml").write_text(TWO_AXES)
-    nominal = compile_model(path)
+    nominal = load_compiled(path)
     text, _ = urdf_of(nominal, urdf_behind(path))
     (tmp_path / "made.urdf").write_text(text)
-    made = compile_model(tmp_path / "made.urdf")
+    made = load_compiled(tmp_path / "made.urdf")
     other = pinocchio.buildModelFromXML(text)
     order = [other.joints[other.getJointId(nominal.joint(j).name)].idx_v for j in range(nominal.njnt)]
     assert other.nv == other.nq or "continuous" in text
@@ -78,7 +78,7 @@ def test_a_diagnosis_writes_urdf_and_says_what_it_lacks(tmp_path):
     assert any(line.startswith("friction.load joint_2") for line in lines)
     text = (tmp_path / "closed.urdf").read_text()
     assert all(line in text for line in lines)
-    as_urdf, as_mjcf = (compile_model(tmp_path / f"closed.{kind}") for kind in ("urdf", "xml"))
+    as_urdf, as_mjcf = (load_compiled(tmp_path / f"closed.{kind}") for kind in ("urdf", "xml"))
     q, v, a = np.random.default_rng(1).normal(0.0, 0.7, (3, 3))
     np.testing.assert_allclose(torques(as_urdf, q, v, a), torques(as_mjcf, q, v, a), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(as_urdf.dof_frictionloss, as_mjcf.dof_frictionloss, rtol=1e-5)
@@ -87,7 +87,7 @@ def test_a_diagnosis_writes_urdf_and_says_what_it_lacks(tmp_path):
 
 def test_a_urdf_keeps_its_shapes_and_says_that_zeros_moved(tmp_path):
     path = ROOT / "tests" / "models" / "ur10e.urdf"
-    nominal = compile_model(path)
+    nominal = load_compiled(path)
     nominal.qpos0[1] = 0.05
     text, lines = urdf_of(nominal, path)
     assert "package://ur_description/meshes/ur10e/collision/shoulder.stl" in text

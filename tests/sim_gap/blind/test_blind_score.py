@@ -1,17 +1,17 @@
 """Sealing and scoring of the blind check, on answers and labels made by hand."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from armlink.errors import BadInput, Refused
-from sim_gap.blind.bench import MANIFEST, _answers, open_labels, run_bench, seal, verify, write_answer
+from sim_gap.blind.bench import MANIFEST, open_labels, run_bench, seal, seal_answers, verify
 from sim_gap.blind.cases import label_of
-from sim_gap.blind.judge import judge
 from sim_gap.blind.recipe import draw, recipes
-from sim_gap.blind.score import answer_name, score
+from sim_gap.blind.score import answer_name, judge, score
 
 
 def truth(effect: str, joint: str = "joint_2", undecided: str = "", **parameters: float) -> dict[str, Any]:
@@ -172,6 +172,11 @@ def test_score_counts_shares() -> None:
     json.dumps(result)
 
 
+def write_answer(folder: Path, name: str, given: dict[str, Any]) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(given))
+
+
 def test_labels_stay_shut_until_the_answers_are_sealed(tmp_path: Path) -> None:
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels/a.json").write_text(json.dumps(label(case="a")))
@@ -187,8 +192,10 @@ def test_a_broken_seal_is_refused(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_answer(tmp_path, name, answer())
     digest = seal(tmp_path)
-    with pytest.raises(Refused, match="sealed"):
-        write_answer(tmp_path, "c", answer())
+    write_answer(tmp_path, "c", answer())
+    with pytest.raises(Refused, match=r"c\.json: was added"):
+        verify(tmp_path, digest)
+    (tmp_path / "c.json").unlink()
     with pytest.raises(Refused, match="not the manifest"):
         verify(tmp_path, "0" * 64)
     kept = (tmp_path / "a.json").read_text()
@@ -202,28 +209,27 @@ def test_a_broken_seal_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / MANIFEST).exists()
 
 
-def fail(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
-    with (sim.parent.parent / "tried").open("a") as stream:
-        stream.write(sim.parent.name + "\n")
+def fail(folder: Path, withheld: Any) -> dict[str, Any]:
+    with (folder.parent / "tried").open("a") as stream:
+        stream.write(folder.name + "\n")
     raise ZeroDivisionError
 
 
 @pytest.mark.long
 def test_a_diagnosis_that_breaks_ends_the_bench_and_says_where(tmp_path: Path) -> None:
-    todo = [(f"case_{k:04d}", "") for k in range(1000)]
-    with pytest.raises(ZeroDivisionError) as raised:
-        list(_answers(fail, tmp_path, todo, 1))
-    assert "case_0000" in raised.value.__notes__[0]
-    with pytest.raises(ZeroDivisionError):
-        list(_answers(fail, tmp_path, todo, 2))
-    assert len((tmp_path / "tried").read_text().splitlines()) < 1 + len(todo)
+    jobs = {f"case_{k:04d}": partial(fail, tmp_path / f"case_{k:04d}", []) for k in range(1000)}
+    for workers in (1, 2):
+        with pytest.raises(ZeroDivisionError) as raised:
+            seal_answers(tmp_path / f"answers_{workers}", jobs, workers)
+        assert workers == 2 or "case_0000" in raised.value.__notes__[0]
+    assert len((tmp_path / "tried").read_text().splitlines()) < 1 + len(jobs)
 
 
 def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
     seen = []
 
-    def diagnose(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
-        seen.append((sim.name, train[0].name, heldout[0].name, tuple(exclude)))
+    def diagnose(folder: Path, withheld: Any) -> dict[str, Any]:
+        seen.append(({path.name for path in folder.iterdir()}, withheld))
         assert not (tmp_path / "bench/answers" / MANIFEST).exists()
         if len(seen) == 1:
             raise BadInput("cannot be used")
@@ -232,7 +238,7 @@ def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
     result = run_bench(diagnose, tmp_path / "bench", seed=4, cases=2, workers=1, lengths=(8.0, 5.0))
     assert result["label_withheld"]["cases"] == 2
     assert len(seen) == 2 + result["effect_withheld"]["cases"]
-    assert seen[0][:3] == ("sim.xml", "train.csv", "heldout.csv")
+    assert seen[0] == ({"sim.xml", "train.csv", "heldout.csv"}, [])
     assert len(result["sealed"]) == 64
     with pytest.raises(BadInput, match="earlier check"):
         run_bench(diagnose, tmp_path / "bench", cases=1)
@@ -245,7 +251,7 @@ def test_many_effects_at_once_are_different_and_can_be_told_apart():
     assert drawing is not None
     effects = [each.effect for each in drawing.drawn]
     assert len(effects) == len(set(effects)) == wanted[0].several
-    told = label_of(drawing)
+    told = label_of(drawing, {})
     assert told["kind"] == "several"
     assert [each["effect"] for each in told["effects"]] == effects
 

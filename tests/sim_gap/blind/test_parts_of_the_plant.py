@@ -1,7 +1,9 @@
 """Single parts of the blind check's plant against what their laws say: drives, friction, sensors, servos."""
 
+from functools import partial
+from pathlib import Path
+
 import numpy as np
-import pytest
 
 from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
@@ -108,8 +110,13 @@ def test_servos_of_a_case_have_the_bandwidth_and_damping_of_hobby_servos() -> No
     assert set(found.motions["train"]).isdisjoint(found.motions["heldout"])
 
 
-def test_one_worker_diagnoses_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "answer_case", lambda diagnose, cases, case, withheld: (case, diagnose(case)))
+def test_one_worker_diagnoses_in_this_process(tmp_path: Path) -> None:
     asked: list[str] = []
-    assert list(bench._answers(asked.append, None, [("a", ""), ("b", "")], 1)) == [("a", None), ("b", None)]
+
+    def ask(name: str) -> dict[str, str]:
+        asked.append(name)
+        return {"verdict": name}
+
+    digest = bench.seal_answers(tmp_path / "answers", {name: partial(ask, name) for name in "ab"}, workers=1)
     assert asked == ["a", "b"]
+    assert [each["verdict"] for each in bench.verify(tmp_path / "answers", digest).values()] == asked

@@ -7,9 +7,8 @@ import pytest
 
 from calib.observer.decision import Event
 from calib.observer.watch_loop import WatchHistory
-from sim_gap.demo.account import Account
 from sim_gap.demo.bench import drifting_joint
-from sim_gap.demo.run import BY, Demo, last_word
+from sim_gap.demo.run import BY, Account, Demo, last_word
 
 
 @pytest.mark.parametrize(

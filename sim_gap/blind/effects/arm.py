@@ -1,11 +1,14 @@
-"""Sensors, friction, gears, motors and drives of a joint that differ from the nominal model."""
+"""Joints, links and base that differ from the nominal model: sensors, friction, gears, motors, drives, masses, tilt."""
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from gcomp.arm.inertials import steiner
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.arms import BenchArm, compile_arm, inverse
 from sim_gap.blind.effects.drawn_effect import (
     ArmSetting,
     Draw,
@@ -22,16 +25,9 @@ from sim_gap.blind.scene import LEAST_SPEED, THINNED_S, Scene, rms
 
 PERIOD_S = 1.0 / RECORDED_HZ
 """Sample interval of the recordings [s]: shorter delays do not show, and those of drives take two to four."""
-LEAST_ELASTIC_NM = 0.25
-"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
-LEAST_ROTOR_SHARE = 0.12
-"""Least rotor inertia behind a spring, as a share of its joint's: the simulated arm has none below a tenth."""
+XYZ = ("x", "y", "z")
+INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 SLOW = "needs steps, a chirp or faster logging"
-
-
-def fifth_of_swing(scene: Scene) -> Array:
-    """A fifth of the range in which a torque mostly lies: a play is drawn for one that swings far beyond it."""
-    return np.asarray(0.2 * np.subtract(*np.quantile(scene.torque, [0.95, 0.05], axis=0)))
 
 
 def has_varying_load(scene: Scene, _: Array) -> Any:
@@ -62,9 +58,9 @@ def motor_limit(scene: Scene, random: np.random.Generator) -> Array:
 
 
 def gear_stiffness(scene: Scene, random: np.random.Generator) -> Array:
-    """From the RMS deflection [rad]; of a joint that shows it, with a resonance above 4 Hz."""
+    """From the RMS deflection [rad]; of a joint that shows it by 0.25 N·m, with a resonance above 4 Hz."""
     stiffness = rms(scene.torque) / random.uniform(0.015, 0.04)
-    shown = scene.turn_felt(scene.torque / stiffness).max(0) > LEAST_ELASTIC_NM
+    shown = scene.turn_felt(scene.torque / stiffness).max(0) > 0.25
     return np.where(shown & (stiffness >= (2 * np.pi * 4.0) ** 2 * scene.inertia), stiffness, np.inf)
 
 
@@ -74,9 +70,10 @@ def gear_play(scene: Scene, random: np.random.Generator) -> Array:
 
 
 def heavy_rotor(scene: Scene, j: int) -> dict[str, Any]:
-    """The nominal arm with a rotor that a spring can carry, as a field of DrawnEffect."""
-    least = float(LEAST_ROTOR_SHARE / (1.0 - LEAST_ROTOR_SHARE) * scene.link_inertia[j])
-    return {"nominal": lambda arm: arm.with_entry("armature", j, max(float(arm.armature[j]), least))}
+    """The nominal arm with a rotor of 12 % of the joint's inertia or more: behind a spring the simulated arm has none
+    below a tenth."""
+    least = float(0.12 / (1.0 - 0.12) * scene.link_inertia[j])
+    return {"nominal": lambda arm: arm.with_entries(j, armature=max(float(arm.armature[j]), least))}
 
 
 def offset_twin(scene: Scene, j: int) -> dict[str, Any]:
@@ -104,7 +101,12 @@ SIZED = (
     SizedDraw("torque.offset", "offset", lambda s, r: s.sensor_level(r) * r.uniform(1.0, 2.0), sound=0.0),
     SizedDraw("torque.gain", "gain", lambda s, r: s.sensor_level(r) / rms(s.torque), 0.06, 0.25, sound=1.0),
     SizedDraw("torque.drift", "rate", lambda s, r: 2.5 * s.sensor_level(r) / s.seconds, sound=0.0),
-    SizedDraw("torque.hysteresis", "width", lambda s, r: 1.4 * s.sensor_level(r), most=fifth_of_swing),
+    SizedDraw(
+        "torque.hysteresis",
+        "width",
+        lambda s, r: 1.4 * s.sensor_level(r),
+        most=lambda s: 0.2 * np.subtract(*np.quantile(s.torque, [0.95, 0.05], axis=0)),  # it swings far beyond a play
+    ),
     SizedDraw(
         "torque.deadband",
         "width",
@@ -194,7 +196,7 @@ def _on_coulomb(
     name = scene.arm.names[j]
     settings = ArmSetting("friction.coulomb", name, {"torque": torque}), ArmSetting(effect, name, values)
     if random.random() < 0.5:
-        return on_joint(scene, j, effect, values, nominal=lambda arm: arm.with_entry("frictionloss", j, torque))
+        return on_joint(scene, j, effect, values, nominal=lambda arm: arm.with_entries(j, frictionloss=torque))
     return on_joint(scene, j, effect, values, settings=settings, implied=("friction.coulomb",))
 
 
@@ -252,10 +254,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect:
         ArmSetting("friction.coulomb", names[j], {"torque": coulomb}),
         ArmSetting("friction.viscous", names[j], {"damping": viscous}),
     )
-
-    def without_motor(arm: BenchArm) -> BenchArm:
-        return arm.with_entry("armature", j, 0.0).with_entry("damping", j, 0.0).with_entry("frictionloss", j, 0.0)
-
+    without_motor = partial(BenchArm.with_entries, joint=j, armature=0.0, damping=0.0, frictionloss=0.0)
     own = {"inertia": rotor, "coulomb": coulomb, "viscous": viscous}
     values = {"coefficient": coefficient, "other_joint": float(k + 1), **own}
     implied = tuple(setting.effect for setting in settings[1:])
@@ -264,7 +263,96 @@ def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     )
 
 
+# ---- links and base
+
+
+def _felt(scene: Scene, other: BenchArm, joint: int) -> float:
+    """RMS torque that another arm causes at a joint [N·m]."""
+    return max(float(rms(scene.change(other))[joint]), 1e-9)
+
+
+def _scale(scene: Scene, other: BenchArm, random: np.random.Generator) -> float:
+    """Factor on a change at which it shows at the most sensitive joint."""
+    return float(1.0 / (rms(scene.change(other)) / scene.sensor_level(random)).max())
+
+
+def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
+    """A shifted centre of mass, across the link's own axis, so that its own joint shows it."""
+    arm, level = scene.arm, scene.sensor_level(random)
+    shift = random.uniform(0.15, 0.3)
+    for link in random.permutation(arm.n).tolist():
+        across = np.cross(arm.axis[link], random.standard_normal(3))
+        unit = across / np.linalg.norm(across) * 1e-2
+        moment = unit * (level[link] / _felt(scene, arm.with_moved(link, unit), link))
+        if np.linalg.norm(moment) / arm.mass[link] > shift:
+            continue
+        moved = arm.with_moved(link, moment)
+        weight = inverse(compile_arm(moved), scene.motion[0], *np.zeros((2, *scene.torque.shape))) - scene.gravity
+        weighs = rms(weight)[link] > 0.1 * _felt(scene, moved, link)
+        why = "" if weighs else "the axis is vertical: a moved mass shows only in its inertia"
+        others = () if weighs else ("link.inertia",)
+        values = {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}
+        moves = partial(BenchArm.with_moved, link=link, moment=moment)
+        return DrawnEffect("link.mass_moment", values, links=moves, undecided=why, confused_with=others)
+    return None
+
+
+def inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
+    """Additional inertia, mostly about the joint's own axis, that no shift of mass explains."""
+    arm, level, nothing = scene.arm, 1.3 * scene.sensor_level(random), np.zeros(3)
+    for link in random.permutation(arm.n).tolist():
+        unit = 0.01 * (0.55 * np.eye(3) + 0.45 * np.outer(arm.axis[link], arm.axis[link]))
+        wanted = level[link] / _felt(scene, arm.with_added(link, 0.0, nothing, unit), link)
+        if 0.01 * wanted <= 0.12 + 0.03 * float(arm.mass[link:].sum()):
+            added = unit * wanted
+            values = {arm.names[link]: {name: float(added[r, c]) for name, r, c in INERTIA}}
+            adds = partial(BenchArm.with_added, link=link, mass=0.0, moment=nothing, inertia=added)
+            return DrawnEffect("link.inertia", values, links=adds)
+    return None
+
+
+def payload(scene: Scene, random: np.random.Generator) -> DrawnEffect:
+    tip = scene.arm.n - 1
+    com = scene.arm.com[tip] * 1.5 + random.uniform(-0.06, 0.06, 3)
+    wanted = 0.5 * 1.5 * _scale(scene, _loaded(scene.arm, 0.5, com), random)
+    mass = float(np.clip(wanted, 0.3, 6.0) * random.uniform(1.0, 1.5))
+    values = {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}
+    return DrawnEffect("link.payload", {"arm": values}, links=lambda true: _loaded(true, mass, com))
+
+
+def _loaded(arm: BenchArm, mass: float, com: Array) -> BenchArm:
+    return arm.with_added(arm.n - 1, mass, mass * com, mass * steiner(com) + 0.002 * mass * np.eye(3))
+
+
+def tilt(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
+    arm = scene.arm
+    down = arm.gravity / np.linalg.norm(arm.gravity)
+    across = np.cross(down, random.standard_normal(3))
+    across /= np.linalg.norm(across)
+    wanted = 0.01 * _scale(scene, _tilted(arm, 0.01 * across), random)
+    if wanted > 0.12:
+        return None
+    turn = across * max(wanted, 0.03)
+    # named are the two base axes closest to perpendicular to gravity
+    axes = np.sort(np.argsort(np.abs(arm.gravity), kind="stable")[:2])
+    aligned = np.abs(down).max() > 0.999
+    values = {f"angle_{k + 1}": float(turn[axis]) for k, axis in enumerate(axes)} if aligned else {}
+    return DrawnEffect("base.tilt", {"arm": values}, links=lambda true: _tilted(true, turn))
+
+
+def _tilted(arm: BenchArm, turn: Array) -> BenchArm:
+    """The base rotated by the rotation vector `turn` [rad]: gravity rotates the other way in the base frame."""
+    angle = float(np.linalg.norm(turn))
+    axis, g = turn / angle, arm.gravity
+    gravity = g * np.cos(angle) - np.cross(axis, g) * np.sin(angle) + axis * (axis @ g) * (1.0 - np.cos(angle))
+    return replace(arm, gravity=gravity)
+
+
 DRAWS: dict[str, Draw] = {
+    "link.mass_moment": mass_moment,
+    "link.inertia": inertia,
+    "link.payload": payload,
+    "base.tilt": tilt,
     **{each.effect: each for each in SIZED},
     "torque.crosstalk": crosstalk,
     "position.eccentricity": eccentricity,
