@@ -2,7 +2,7 @@
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -164,17 +164,13 @@ class Minute:
     """Path of all joints together [rad]."""
     parts: tuple[Rows, ...]
 
-    def write(self, path: Path, names: tuple[str, ...]) -> Iterator[None]:
-        """Write an MCAP recording in parts, so that other work can go on between them; raises OSError."""
-        begun, written = self.parts[0][0][0], 0
+    def write(self, path: Path, names: tuple[str, ...]) -> None:
+        """Write an MCAP recording; raises OSError."""
+        begun = self.parts[0][0][0]
         with RecordingWriter(path, names) as writer:
             for t, channels in self.parts:
                 for k, at in enumerate((t - begun).tolist()):
                     writer.append(at, {name: values[k] for name, values in channels.items()})
-                written += len(t)
-                if written >= 300:  # some hundredths of a second
-                    written = 0
-                    yield
 
 
 class BusiestMinute:
