@@ -19,7 +19,7 @@ from calib.daemon.view import HistoryPoint
 from calib.daemon.web import history, routes
 from calib.daemon.web import server as page_module
 from calib.daemon.web.history import LARGEST_ID, Id
-from calib.daemon.web.server import page_files
+from calib.daemon.web.server import PAGE
 from calib.daemon.web.stream import Streams
 
 
@@ -210,8 +210,8 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     assert writing == {("/api/proposals/{id}/approve", "post"), ("/api/proposals/{id}/reject", "post")}
     bodies = json.dumps([described[path][method].get("requestBody") for path, method in writing])
     assert "Decision" in bodies
-    app = open_app(view, Streams(view), page_files())
-    known = {*described, "/openapi.json", *page_files()}
+    app = open_app(view, Streams(view))
+    known = {*described, "/openapi.json", PAGE}
     assert all(path in known for path in route_paths(app.routes))
     offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
     reading = {"status", "joints", "estimates", "external", "events", "history_pages", "proposals", "subscribe"}
@@ -278,8 +278,7 @@ def test_the_page_comes_from_here_alone(server: Served) -> None:
     assert "default-src 'none'" in policy
     assert "http" not in policy
     files: Callable[[str], Any] = client.get
-    for path in page_files():
-        answer = files(path)
-        assert answer.status_code == 200
-        assert "://" not in answer.text.replace("http://www.w3.org/", "")
-        assert client.get(path, headers={"if-none-match": answer.headers["etag"]}).status_code == 304
+    answer = files(PAGE)
+    assert answer.status_code == 200
+    assert "://" not in answer.text.replace("http://www.w3.org/", "")
+    assert client.get(PAGE, headers={"if-none-match": answer.headers["etag"]}).status_code == 304
