@@ -149,14 +149,14 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     return found
 
 
-REFERENCE = 360
-"""Rows without a change that the belief is learned from: four minutes of creeping."""
 LONGEST = 2 * LONGEST_WINDOW
 """Rows of a test at most: the latest. There is one after each LONGEST_WINDOW rows: of seven joints that creep in turn,
 40 s."""
+REFERENCE = 3 * LONGEST
+"""Rows without a change that the belief is learned from: four minutes of creeping."""
 AGREEING = 2
 """Tests in a row that must say the same until it is an event."""
-UNEXPLAINED = 3
+UNEXPLAINED = AGREEING + 1
 """The same of tests that nothing explains: the first ones after a change have rows of before it."""
 SCHEMA = "moving/1"
 

@@ -153,6 +153,11 @@ class Recalibrator:
         """Joints of the last write."""
         self._check: AfterWrite | None = None
 
+    @property
+    def checking(self) -> tuple[int, ...]:
+        """Joints of the last write, while `sample` checks it."""
+        return () if self._check is None else self._written
+
     def recalibrate(self, finding: DriftFinding) -> Recalibration:
         """Propose and apply at once. Raises Refused, BusFault."""
         proposed = self.propose(finding, by=APPLIED_BY)

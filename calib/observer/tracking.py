@@ -13,7 +13,14 @@ import numpy as np
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest, DetectionLimits, limits
-from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
+from calib.observer.config import (
+    AUDIT_ROWS,
+    INITIAL_GAIN_STD,
+    INITIAL_OFFSET_STD,
+    LONGEST_WINDOW,
+    PLACE_SIZE,
+    ObserverConfig,
+)
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
@@ -168,8 +175,6 @@ class Cusum:
         self._rising = as_array("rising", values.get("rising", unknown), shape).astype(int)
 
 
-PLACE_SIZE = 0.2
-"""Poses within this distance in every joint count as one pose [rad]."""
 PLACE_ROWS = 3
 """Rows of one pose that the filter and a window take: a repeated pose adds no information."""
 PLACE_MEMORY = 20

@@ -13,8 +13,7 @@ from typing import Any
 import psycopg
 import sqlalchemy as sa
 
-SILENT_SECONDS = 10.0
-"""A server that answers nothing for this time has gone [s]."""
+from calib.records.database import ANSWER_SECONDS
 
 
 class ImpatientConnection(psycopg.Connection[Any]):
@@ -22,7 +21,7 @@ class ImpatientConnection(psycopg.Connection[Any]):
 
     def wait(self, *given: Any, **options: Any) -> Any:
         """As psycopg's, with an end; all that asks the server goes through here, connecting apart."""
-        seconds, silent = SILENT_SECONDS, threading.Event()
+        seconds, silent = ANSWER_SECONDS, threading.Event()
 
         def hang_up() -> None:
             silent.set()

@@ -15,7 +15,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.loop.messages import BATCH_SECONDS, Batch
 from armlink.recording.mcap import RecordingWriter
-from calib.daemon.environment import RunAside
+from calib.daemon.environment import Worker
 from calib.daemon.settings import Configuration, RecordingSettings
 from calib.daemon.state.events import EventLog
 
@@ -223,7 +223,7 @@ class Recordings:
     the thread that `run` gives work to.
     """
 
-    def __init__(self, directory: Path, configuration: Configuration, run: RunAside) -> None:
+    def __init__(self, directory: Path, configuration: Configuration, run: Worker) -> None:
         """Files go to `directory`, which is made with the first one."""
         self._directory, self._configuration, self._run = directory, configuration, run
         self._waiting, self._full = 0, False

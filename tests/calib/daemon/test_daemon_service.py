@@ -420,7 +420,7 @@ def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -
     daemon.service.reload(daemon.arm, settings("apply", observer={"window": 16}))
     status = daemon.view.status()
     assert (status.policy, status.rows) == ("apply", rows)
-    assert daemon.service.records.observation.feed.observer.config.window == 16
+    assert daemon.service.records.feed.observer.config.window == 16
 
 
 def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
