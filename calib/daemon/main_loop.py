@@ -77,12 +77,12 @@ def watchdog_seconds() -> float | None:
 
 SILENT_SECONDS = 15.0
 """A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
+BEGIN_SECONDS = 2 * SILENT_SECONDS
+"""Time for a new bus process to send its first message [s]."""
 PAUSE_SECONDS = 2.0
 """A timer of this process that is later than this says nothing of the bus process [s]."""
 AGAIN_SECONDS = 5.0
 """Time to the next attempt where the system gives no process [s]."""
-BEGIN_SECONDS = 30.0
-"""Time for a new bus process to send its first message [s]."""
 SWITCH_SECONDS = 0.001
 """A thread at work (reading history, say) lets the event loop go on after this time; Python's default is five times
 that, and an answer waits for it several times [s]."""

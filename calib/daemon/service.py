@@ -161,7 +161,6 @@ class Service:
             self.external.renew(self.records.feed.calibration, self.records.feed.gravity)
 
     def save(self, history: bool = False) -> None:
-        """Save the observer's state now and, if asked for, a point of history."""
         if self.records.feed is not None:
             self.storage.save(self.records.feed, history)
 

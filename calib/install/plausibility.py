@@ -59,8 +59,6 @@ class Refusal(Enum):
 
 
 class GateRefused(Refused):
-    """A gate refuses a record; nothing was written."""
-
     def __init__(self, refusal: Refusal, joint: str, **values: object) -> None:
         """`values` fill in the refusal's text."""
         super().__init__(f"{joint}: {refusal.value.format(joint=joint, **values)}; nothing was written")

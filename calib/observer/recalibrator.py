@@ -137,8 +137,6 @@ def recalibrated_record(
 
 
 class Recalibrator:
-    """Turns findings into records, and writes them."""
-
     def __init__(
         self, arm: ArmFile, controllers: Controllers, store: RecordStore, current: CalibrationRecord | None = None
     ) -> None:

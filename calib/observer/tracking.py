@@ -166,7 +166,6 @@ class Cusum:
         self._sums[at], self._rising[at] = 0.0, 0
 
     def save(self) -> dict[str, Any]:
-        """The sums and how long they have been rising, as JSON values."""
         return {"sums": self._sums.tolist(), "rising": self._rising.tolist()}
 
     def restore(self, values: dict[str, Any]) -> None:
@@ -225,7 +224,6 @@ class PoseMemory:
         self._position, self._mean, self._count = self._position[:0], self._mean[:0], self._count[:0]
 
     def save(self) -> dict[str, Any]:
-        """Poses, mean residuals and counts as JSON values."""
         return {"places": [self._position.tolist(), self._mean.tolist(), self._count.tolist()]}
 
     def restore(self, values: dict[str, Any]) -> None:

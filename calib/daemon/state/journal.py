@@ -148,7 +148,6 @@ class Journal:
 
     @property
     def waiting(self) -> int:
-        """Number of transactions that are not on disk yet."""
         return len(self._queue)
 
     @property
@@ -400,7 +399,6 @@ class Journal:
 
     @property
     def last_event(self) -> int:
-        """Id of the newest event on disk; 0 if there is none."""
         return self._last_event
 
     def least_ages(self, kind: str, now: float) -> list[tuple[str | None, dict[str, Any], float]]:

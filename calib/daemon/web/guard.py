@@ -56,8 +56,6 @@ class Access:
 
 
 class Denied(Exception):
-    """A request that is refused here."""
-
     def __init__(self, status: int, why: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(why)
         self.status, self.headers = status, headers or {}
@@ -75,7 +73,6 @@ class RequestGuard:
         self._requests, self._wrong = RateLimit(REQUESTS), RateLimit(WRONG_TOKENS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on to the application, or refuse it."""
         if scope["type"] != "http":
             return
         peer = peer_of(scope)
