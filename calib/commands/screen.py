@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -13,12 +12,10 @@ from rich.progress import BarColumn, Progress
 from rich.table import Column, Table
 
 from armlink.arm_file import ArmFile
-from armlink.commands.early_end import early_end
 from armlink.commands.plain_console import PlainColumn, PlainConsole
 from armlink.commands.plain_console import confirm as ask_to_confirm
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
-from armlink.loop.driver import ArmDriver
 from calib.plan.types import SCOUT, SCOUT_TITLE, SweepPlan, reading_name
 from calib.report.tables import interval_table
 
@@ -26,6 +23,7 @@ if TYPE_CHECKING:
     from calib.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
+SPACE_CLEAR = "Is its space clear?"
 _CONSOLE = PlainConsole()
 """For progress and warnings."""
 
@@ -109,25 +107,8 @@ def confirm(motion: str, question: str, agreed: bool = False) -> list[str]:
     return [f"{motion}. {question} There is no terminal to ask on: the arm moves now"]
 
 
-@contextmanager
-def moving(
-    arm: ArmFile, title: str, motion: str, agreed: bool, again: str | Callable[[], str], opened: Callable[[], ArmDriver]
-) -> Iterator[tuple[ArmDriver, SweepScreen]]:
-    """An arm that makes this `motion`, once a person has agreed: its link, enabled, and the screen for its progress.
-
-    `again` is the command that goes on after an early end.
-    """
-    unasked = confirm(motion, "Is its space clear?", agreed)
-    with early_end(arm, again) as work, opened() as link:
-        link.start()
-        print_lines(unasked)
-        work.enabled = True
-        with SweepScreen(title) as screen:
-            link.enable()
-            yield link, screen
-
-
 def print_preflight(found: "Preflight", console: PlainConsole) -> None:
+    """Print the findings of the pre-flight, one row per joint."""
     measured = ["torque noise [N·m]", "torque at rest [N·m]", "drive [°C]"]
     pushed = np.isfinite(found.stops).any()
     table = Table("joint", *measured, *(["lower stop [rad]", "upper stop [rad]"] if pushed else []))

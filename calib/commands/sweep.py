@@ -69,13 +69,14 @@ def sweep(
     from functools import partial
 
     from armlink.arm_file import SIMULATED, load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import sweep_motion, sweep_section, with_hold
-    from calib.commands.screen import moving, warn_late
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines, warn_late
     from calib.commissioning.model_checks import refuse_impossible_sweep
     from calib.dataset import MANIFEST, new_folder, require_vacant
     from calib.sweep.preflight import find_stops, listen
@@ -99,6 +100,7 @@ def sweep(
         raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")
     require_vacant(out, resume)
     motion = f"{arm_file.name} will move through its whole range, {_load(reference_mass)}"
+    unasked = confirm(motion, SPACE_CLEAR, dry_run or yes)
     load = reference_mass if dry_run else 0.0
 
     def going_on() -> str:
@@ -106,27 +108,31 @@ def sweep(
         return command_line("sweep", *words, out=out, reference_mass=reference_mass or None, bus=bus, hold=hold)
 
     of_link = None if dry_run else bus
-    opened = partial(open_link, arm_file, of_link, simulated=dry_run, load=load)
-    title = f"{arm_file.name}, {_load(reference_mass)}"
-    with moving(arm_file, title, motion, dry_run or yes, going_on, opened) as (link, screen):
-        on_stall = screen.on_stall(keep_going)
-        found = heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
-        if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
-            pushed = partial(screen.count, what="stops, each touched by its joint")
-            found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
-            for line in found.left_out:
-                screen.say(line)
-        data = run_sweep(
-            link,
-            arm_file,
-            out,
-            reference_mass=reference_mass,
-            resume=resume,
-            progress=screen.update,
-            seed=seed,
-            on_stall=on_stall,
-            bus=of_link,
-        )
+    opened = open_link(arm_file, of_link, simulated=dry_run, load=load)
+    with early_end(arm_file, going_on) as work, opened as link:
+        link.start()
+        print_lines(unasked)
+        work.enabled = True
+        with SweepScreen(f"{arm_file.name}, {_load(reference_mass)}") as screen:
+            link.enable()
+            on_stall = screen.on_stall(keep_going)
+            found = heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
+            if check_stops and not resume and not reference_mass and sweep_motion(arm_file) == "steps":
+                pushed = partial(screen.count, what="stops, each touched by its joint")
+                found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
+                for line in found.left_out:
+                    screen.say(line)
+            data = run_sweep(
+                link,
+                arm_file,
+                out,
+                reference_mass=reference_mass,
+                resume=resume,
+                progress=screen.update,
+                seed=seed,
+                on_stall=on_stall,
+                bus=of_link,
+            )
         lateness = link.stats.lateness
     _show(arm_file, found, data, results(json_file), _again(arm, bus, hold, dry_run))
     warn_late(arm_file, lateness)

@@ -35,32 +35,38 @@ def verify(
 
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """
-    from functools import partial
-
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.extras import require_extra
     from armlink.loop.open import open_arm
     from calib.arm.kinematics import with_tool
     from calib.arm.sweep_section import sweep_motion
-    from calib.commands.screen import moving
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
     if report is not None:
         require_extra("--report", "reports")
     arm_file = with_tool(load_arm(arm), tool)
-    gravity, calibration = _records(RecordStore(store), arm_file, record or [])
-    if calibration is None and sweep_motion(arm_file) == "creep":
-        raise no_record(arm_file, "calibration")
-    motion = f"{arm_file.name} will drive to {poses} poses all over its range"
-    again, opened = command_line("verify", arm, bus=bus, tool=tool, store=store), partial(open_arm, arm_file, bus)
-    with moving(arm_file, f"{arm_file.name}: verify", motion, yes, again, opened) as (link, screen):
-        watch, bridge = screen.count, screen.on_stall(keep_going)
-        result = run_verify(
-            link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
-        )
+    unasked = confirm(f"{arm_file.name} will drive to {poses} poses all over its range", SPACE_CLEAR, yes)
+    with (
+        early_end(arm_file, command_line("verify", arm, bus=bus, tool=tool, store=store)) as work,
+        open_arm(arm_file, bus) as link,
+    ):
+        gravity, calibration = _records(RecordStore(store), arm_file, record or [])
+        if calibration is None and sweep_motion(arm_file) == "creep":
+            raise no_record(arm_file, "calibration")
+        link.start()
+        print_lines(unasked)
+        work.enabled = True
+        with SweepScreen(f"{arm_file.name}: verify") as screen:
+            link.enable()
+            watch, bridge = screen.count, screen.on_stall(keep_going)
+            result = run_verify(
+                link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
+            )
     _show(result, results(json_file))
     if result.passed:
         suggest(command_line("daemon", arm, bus=bus, store=store))

@@ -28,13 +28,12 @@ def weigh(
 
     Example: armlink weigh sarcos --bus socketcan:vcan0 --json -
     """
-    from functools import partial
-
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results
     from armlink.loop.open import open_arm
-    from calib.commands.screen import moving
+    from calib.commands.screen import SPACE_CLEAR, SweepScreen, confirm, print_lines
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
     from calib.sweep.verify import run_weigh
@@ -42,12 +41,20 @@ def weigh(
     arm_file, records = load_arm(arm).model_copy(update={"tool": None}), RecordStore(store)
     gravity, calibration = records.required(GravityRecord, arm_file), records.required(CalibrationRecord, arm_file)
     motion = f"{arm_file.name} will drive to {poses} poses all over its range, with its load"
-    again, opened = command_line("weigh", arm, bus=bus, store=store), partial(open_arm, arm_file, bus)
-    with moving(arm_file, f"{arm_file.name}: weigh", motion, yes, again, opened) as (link, screen):
-        watch, bridge = screen.count, screen.on_stall(keep_going)
-        payload, reached = run_weigh(
-            link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
-        )
+    unasked = confirm(motion, SPACE_CLEAR, yes)
+    with (
+        early_end(arm_file, command_line("weigh", arm, bus=bus, store=store)) as work,
+        open_arm(arm_file, bus) as link,
+    ):
+        link.start()
+        print_lines(unasked)
+        work.enabled = True
+        with SweepScreen(f"{arm_file.name}: weigh") as screen:
+            link.enable()
+            watch, bridge = screen.count, screen.on_stall(keep_going)
+            payload, reached = run_weigh(
+                link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
+            )
     _show(payload, reached, results(json_file))
     write_json(json_file, _answer(payload, reached, arm_file.joint_names, (gravity.id, calibration.id)))
 
