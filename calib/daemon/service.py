@@ -31,9 +31,9 @@ from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState, BusiestMinute, LiveWindow, Recordings
-from calib.daemon.state.events import EventLog, Hub, describe, one_alarm_a_joint
+from calib.daemon.state.events import EventLog, describe, one_alarm_a_joint
 from calib.daemon.state.journal import Journal
-from calib.daemon.view import State
+from calib.daemon.view import Hub, State
 from calib.observer.decision import DriftFinding, Event
 from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord

@@ -16,9 +16,8 @@ from calib.daemon import view
 from calib.daemon.observation.observation import ObserverFeed
 from calib.daemon.service import Service
 from calib.daemon.state.arm_state import LONGEST_PAUSE
-from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
-from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from calib.daemon.view import Client, Decisions, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.listening import LiveExternal
 from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm, bar_rotations

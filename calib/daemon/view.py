@@ -4,6 +4,7 @@ All calls but those for events, history and the arm's shape are made on the serv
 thread); no answer waits for bus or disk.
 """
 
+import asyncio
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -394,12 +395,37 @@ class Decisions(Protocol):
         """Drop a pending proposal; `digest` likewise."""
 
 
-class Subscription(Protocol):
-    """One client's stream: bounded; a client that is too slow loses the oldest items and never delays the daemon."""
+class Client(asyncio.Queue[StreamItem]):
+    """One client's items: those of five seconds of joints; used on the event loop's thread only.
 
-    async def get(self) -> JointsItem | EventItem: ...
+    A client that is too slow loses the oldest ones and never delays the daemon.
+    """
 
-    def close(self) -> None: ...
+    def __init__(self, hub: "Hub") -> None:
+        super().__init__(maxsize=50)
+        self._hub = hub
+
+    def add(self, item: StreamItem) -> None:
+        if self.full():
+            self.get_nowait()
+        self.put_nowait(item)
+
+    def close(self) -> None:
+        self._hub.clients.discard(self)
+
+
+class Hub:
+    def __init__(self) -> None:
+        self.clients: set[Client] = set()
+
+    def subscribe(self) -> Client:
+        client = Client(self)
+        self.clients.add(client)
+        return client
+
+    def publish(self, item: StreamItem) -> None:
+        for client in self.clients:
+            client.add(item)
 
 
 class DaemonView(Protocol):
@@ -442,5 +468,5 @@ class DaemonView(Protocol):
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]: ...
 
-    def subscribe(self) -> Subscription:
+    def subscribe(self) -> Client:
         """A new client of the stream, which begins with the present joints."""
