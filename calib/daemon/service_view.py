@@ -17,7 +17,7 @@ from calib.daemon.observation.observation import ObserverFeed
 from calib.daemon.service import Service
 from calib.daemon.state.arm_state import LONGEST_PAUSE
 from calib.daemon.state.journal_rows import HistoryReader
-from calib.daemon.view import Client, Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from calib.daemon.view import Client, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.listening import LiveExternal
 from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm, bar_rotations
@@ -33,7 +33,7 @@ class ServiceView:
         self._service, self._version = service, version("armlink")
         self._history = HistoryReader(service.journal.path)
         self._arm: view.DrawnArm | None = None
-        self.decisions: Decisions = service.recalibrations
+        self.approve, self.reject = service.recalibrations.approve, service.recalibrations.reject
 
     @property
     def _feed(self) -> ObserverFeed | None:

@@ -379,22 +379,6 @@ class NotYet(Exception):
     """A decision that is taken, but not on disk yet; the message says so (HTTP 503)."""
 
 
-class Decisions(Protocol):
-    """Decisions that a person may take through the API. Raises NoSuch, NotPossible.
-
-    The answer is there once the decision is on disk; it stands even if nobody waits for that.
-    """
-
-    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
-        """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
-
-        It is `approved` once that is on disk, and `applied` or `failed` a moment later (an event).
-        """
-
-    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
-        """Drop a pending proposal; `digest` likewise."""
-
-
 class Client(asyncio.Queue[StreamItem]):
     """One client's items: those of five seconds of joints; used on the event loop's thread only.
 
@@ -431,8 +415,15 @@ class Hub:
 class DaemonView(Protocol):
     """Everything that the web layer can reach. Nothing here commands torque or motion."""
 
-    @property
-    def decisions(self) -> Decisions: ...
+    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
+
+        It is `approved` once that is on disk, which is when the answer is there, and `applied` or `failed` a moment
+        later (an event). The decision stands even if nobody waits for the answer. Raises NoSuch, NotPossible.
+        """
+
+    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Drop a pending proposal; likewise."""
 
     def status(self) -> Status: ...
 

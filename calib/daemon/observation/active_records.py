@@ -46,7 +46,7 @@ class ActiveRecords:
         self._arm_state, self._events, self._jobs, self._observe = arm_state, events, jobs, observe
         self._recalibrations = recalibrations
         self.feed: ObserverFeed | None = None
-        """What observes against the records in force; None until there are both."""
+        """The observer against the records in force; None until there are both."""
         self.detail = ""
         """Why there is no observation, or none against the newest records; empty otherwise."""
         self._held: Held = None

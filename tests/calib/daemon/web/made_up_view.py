@@ -20,7 +20,6 @@ class MadeUpView:
 
     def __init__(self) -> None:
         self.hub = Hub()
-        self.decisions = self
         self.begin()
 
     def begin(self) -> None:
