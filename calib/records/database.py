@@ -117,7 +117,7 @@ def open_database(url: str) -> sa.Engine:
         elif connect:
             from calib.records.hanging_server import give_up_when_silent  # psycopg is an extra
 
-            give_up_when_silent(engine)
+            give_up_when_silent(engine, ANSWER_SECONDS)
         _migrate(engine)
     except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
         raise BadInput(f"record store {_shown(full)}: cannot be opened: {first_line(error)}") from None
