@@ -58,7 +58,7 @@ class DailyDiagnosis:
         self._failure = ""
         self._under_way: Future[list[Said]] | None = None
         self._process: subprocess.Popen[str] | None = None
-        self._closed, self._starting = False, threading.Lock()
+        self._closed = threading.Event()
 
     def tick(self) -> None:
         """Start a diagnosis if a day has passed and the arm has moved; say what came of one."""
@@ -87,8 +87,7 @@ class DailyDiagnosis:
 
     def close(self) -> None:
         """End a diagnosis under way; it is made again with the next recording."""
-        with self._starting:
-            self._closed = True
+        self._closed.set()
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -111,17 +110,18 @@ class DailyDiagnosis:
             return self._failed(str(error))
 
     def _run(self, command: list[str]) -> list[Said]:
-        with self._starting:
-            if self._closed:
-                return []
-            self._process = process = subprocess.Popen(
-                command,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
+        if self._closed.is_set():
+            return []
+        self._process = process = subprocess.Popen(
+            command,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        if self._closed.is_set():  # meanwhile
+            process.kill()
         with contextlib.suppress(OSError):  # it may have ended, or the system may not permit it
             os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
             Path(f"/proc/{process.pid}/oom_score_adj").write_text(FIRST_TO_KILL)
