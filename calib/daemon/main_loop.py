@@ -83,6 +83,8 @@ PAUSE_SECONDS = 2.0
 """A timer of this process that is later than this says nothing of the bus process [s]."""
 AGAIN_SECONDS = 5.0
 """Time to the next attempt where the system gives no process [s]."""
+SIGN_OF_LIFE_SECONDS = 1.0
+"""Between two signs of life to systemd, unless its watchdog wants them sooner [s]."""
 SWITCH_SECONDS = 0.001
 """A thread at work (reading history, say) lets the event loop go on after this time; Python's default is five times
 that, and an answer waits for it several times [s]."""
@@ -199,7 +201,7 @@ class Daemon:
             self._ticked = now
             self.service.tick()
             self._judge(now, stood_still)
-        if self._watchdog is not None and now - self._kept_alive >= self._watchdog / 3:
+        if self._watchdog is not None and now - self._kept_alive >= min(SIGN_OF_LIFE_SECONDS, self._watchdog / 3):
             self._kept_alive = now
             self._notify("WATCHDOG=1")
 

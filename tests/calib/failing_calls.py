@@ -215,7 +215,7 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "datetime", now)
         readers = SimpleNamespace(add_reader=nothing, remove_reader=nothing)
         patch.setattr(main_loop, "asyncio", SimpleNamespace(get_running_loop=lambda: readers, Event=asyncio.Event))
-        patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
+        patch.setattr(main_loop, "Worker", lambda *_: Immediate())
         patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
         patch.setenv("NOTIFY_SOCKET", "systemd")
