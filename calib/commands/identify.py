@@ -76,20 +76,30 @@ def identify(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
     from calib.api import Calibrated, calibrated, identified
-    from calib.commands.identify_poses import PoseOptions, identify_poses
+    from calib.commands.identify_poses import identify_poses
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
 
     records = RecordStore(store)
-    masses, held = tuple(reference_mass or ()), tuple(heldout or ())
-    of_poses = PoseOptions(base, tip, masses, held, gain_std, out_model, coefficients, plan)
+    of_poses: dict[str, Any] = {
+        "base": base,
+        "tip": tip,
+        "reference_mass": reference_mass or None,
+        "heldout": heldout or None,
+        "gain_std": gain_std,
+        "out_model": out_model,
+        "coefficients": coefficients,
+        "plan": plan or None,
+    }
     if model is not None:
         if arm is not None or calibration is not None:
             raise BadInput("--arm and --calibration are only for sweeps; poses need only --model")
-        return identify_poses(data, model, of_poses, stated, records, json_file)
-    of_poses.require_none()
+        return identify_poses(data, model, stated, records, json_file, **of_poses)
+    for name, value in of_poses.items():
+        if value is not None:
+            raise BadInput(f"--{name.replace('_', '-')} is only for poses: give the model with --model")
     sweeps, arm_file = load_sweeps(data, arm)
     sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None

@@ -1,7 +1,7 @@
 """`armlink identify` of poses of any robot, with its model: gravity, gains and friction, model files, coefficients."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,26 +21,6 @@ if TYPE_CHECKING:
     from calib.records.store import RecordStore
 
 WRITTEN_SUFFIXES = (".urdf", ".xml")
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """Options that only poses have, as they were given."""
-
-    base: str | None = None
-    tip: str | None = None
-    reference_mass: tuple[str, ...] = ()
-    heldout: tuple[Path, ...] = ()
-    gain_std: float | None = None
-    out_model: Path | None = None
-    coefficients: Path | None = None
-    plan: int = 0
-
-    def require_none(self) -> None:
-        """Raise BadInput if one was given."""
-        for each in fields(self):
-            if getattr(self, each.name) != each.default:
-                raise BadInput(f"--{each.name.replace('_', '-')} is only for poses: give the model with --model")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,26 +83,33 @@ def reference_masses(given: Sequence[str], poses: Sequence[Path]) -> dict[str, f
 def identify_poses(
     poses: Sequence[Path],
     model: str,
-    options: PoseOptions,
     stated: "Corrections",
     store: "RecordStore",
     json_file: Path | None,
+    *,
+    base: str | None,
+    tip: str | None,
+    reference_mass: Sequence[str] | None,
+    heldout: Sequence[Path] | None,
+    gain_std: float | None,
+    out_model: Path | None,
+    coefficients: Path | None,
+    plan: int | None,
 ) -> int:
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from calib.arm.model_files import write_coefficients, write_model
 
-    described = stated_model(model, options.base, options.tip)
-    out_model = options.out_model
+    described = stated_model(model, base, tip)
     if out_model is not None and (described.placed is None or out_model.suffix.lower() not in WRITTEN_SUFFIXES):
         raise BadInput(
             f"--out-model {out_model}: expected a name that ends in .urdf or .xml, and a URDF or MJCF file as --model"
         )
-    masses = reference_masses(options.reference_mass, poses)
+    masses = reference_masses(reference_mass or (), poses)
     if masses and not set(map(str, poses)) - set(masses):
         raise BadInput("--reference-mass: a mass hangs in all poses: give poses without it, too")
     with PlainConsole().status("fitting mass moments, and predicting poses that were held out"):
-        judged = judged_fit(described, poses, options.heldout, masses, options.gain_std, stated)
+        judged = judged_fit(described, poses, heldout or (), masses, gain_std, stated)
     fit, arm_file, record = judged.fit, described.arm_file, None
     if arm_file is not None:
         kept = fit.gravity.record(arm_file)
@@ -135,10 +122,10 @@ def identify_poses(
     if out_model is not None and described.placed is not None and described.path is not None:
         write_model(described.placed, described.path, fit.gravity.beta, out_model)
         out.print(f"{out_model}: the model with these mass moments; all its bodies are physically possible")
-    if options.coefficients is not None:
-        write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, options.coefficients)
-        out.print(f"{options.coefficients}: base parameters, and the names of the regressor's columns")
-    further = fit.best_poses(options.plan) if options.plan else None
+    if coefficients is not None:
+        write_coefficients(described.arm, fit.gravity.beta, fit.gravity.std, coefficients)
+        out.print(f"{coefficients}: base parameters, and the names of the regressor's columns")
+    further = fit.best_poses(plan) if plan else None
     if further is not None:
         _show_plan(judged, *further, out)
     write_json(json_file, _answer(judged, record, further))

@@ -137,7 +137,6 @@ class Rating:
 
     @property
     def note(self) -> str:
-        """Where it comes from, as a comment of the arm file."""
         if self.source == "load":
             return f"rated_torque assumed: {LOAD_FACTOR:g} times the load, since {self.doubt}"
         if self.source == "model":

@@ -37,17 +37,6 @@ Ask = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class TurnedJoint:
-    name: str
-    lower: float
-    """[rad]"""
-    upper: float
-    """[rad]"""
-    gear: float = 1.0
-    """Turns of the drive's output for one of the joint, as an arm file has it."""
-
-
-@dataclass(frozen=True)
 class Match:
     """The drive of a joint, and how that is known."""
 
@@ -72,34 +61,6 @@ def match_in_order(names: Sequence[str], drives: FoundDrives, bus: str) -> list[
             " by hand with --by-hand, or disconnect the other drives"
         )
     return [Match(name, drive, by_hand=False) for name, drive in zip(names, found, strict=True)]
-
-
-def match_by_hand(
-    joints: Sequence[TurnedJoint], drives: FoundDrives, bus: str, ask: Ask
-) -> tuple[list[Match], list[SetupFinding]]:
-    """Ask for each joint to be turned from stop to stop; the drive that reads the motion is its drive.
-
-    The drives have no power meanwhile. Direction and angle are compared with the model's: another gear is a finding,
-    and so is a turned sign of a CANopen drive, where it is set in the drive. Of other families direction and zero
-    become keys of the arm file. Raises BusFault where no drive, or more than one, reads the motion.
-    """
-    _require([joint.name for joint in joints], drives.found, bus)
-    free = {each.address: each for each in drives.found}
-    matches, findings = [], []
-    for joint in joints:
-        ask(f"{joint.name}: turn this joint by hand to its lower stop ({joint.lower:+.2f} rad)")
-        before = drives.positions()
-        ask(f"{joint.name}: now turn it to its upper stop ({joint.upper:+.2f} rad)")
-        after = drives.positions()
-        turned = {each: after[each] - before[each] for each in free}
-        moved = moved_drive(joint.name, turned, bus)
-        drive, ratio = free.pop(moved), turned[moved] / (joint.upper - joint.lower)
-        if drive.family != "canopen":
-            zero = round(float(before[moved] - ratio * joint.lower), 4)
-            drive = replace(drive, drive={**(drive.drive or {}), "direction": 1 if ratio > 0 else -1, "zero": zero})
-        matches.append(Match(joint.name, drive, by_hand=True))
-        findings += _judge(joint, drive, turned[moved])
-    return matches, findings
 
 
 def addresses(found: Sequence[FoundDrive]) -> str:
@@ -129,9 +90,26 @@ def moved_drive(joint: str, turned: dict[str, float], bus: str) -> str:
     return order[0]
 
 
-def _judge(joint: TurnedJoint, drive: FoundDrive, turned: float) -> list[SetupFinding]:
-    expected = (joint.upper - joint.lower) * joint.gear
-    ratio, where = turned / expected, f"{joint.name} ({drive.address})"
+def _turn_by_hand(
+    joint: str, questions: tuple[str, str], free: dict[str, FoundDrive], drives: FoundDrives, bus: str, ask: Ask
+) -> tuple[FoundDrive, float, float]:
+    """The drive that moves between two questions, taken from `free`, and its readings after each [rad].
+
+    The drives have no power meanwhile. Raises BusFault where no drive, or more than one, reads the motion.
+    """
+    readings = []
+    for question in questions:
+        ask(f"{joint}{question}")
+        readings.append(drives.positions())
+    before, after = readings
+    moved = moved_drive(joint, {each: after[each] - before[each] for each in free}, bus)
+    return free.pop(moved), before[moved], after[moved]
+
+
+def _judge(joint: str, drive: FoundDrive, gear: float, way: float, turned: float) -> list[SetupFinding]:
+    """Findings where a drive reads `turned` [rad] from stop to stop, and the model has the `way` [rad] of the joint."""
+    expected = way * gear
+    ratio, where = turned / expected, f"{joint} ({drive.address})"
     findings = []
     if ratio < 0 and drive.family == "canopen":
         what = f"its position counts in the wrong direction: from the lower to the upper stop it read {turned:+.2f} rad"
@@ -143,7 +121,7 @@ def _judge(joint: TurnedJoint, drive: FoundDrive, turned: float) -> list[SetupFi
         )
         remedy = f"correct the drive's gear ratio by the factor {abs(ratio):.3g}, or the stops in the arm file"
         if drive.family != "canopen":
-            remedy = f"give the drive gear: {abs(ratio) * joint.gear:.3g} in the arm file, or correct the stops there"
+            remedy = f"give the drive gear: {abs(ratio) * gear:.3g} in the arm file, or correct the stops there"
         findings.append(SetupFinding("error", what, where, remedy))
     return findings
 
@@ -190,15 +168,15 @@ def _turn_about(position: float) -> tuple[float, float]:
 def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], list[tuple[float, float]]]:
     free = {each.address: each for each in drives.found}
     matches, stops = [], []
+    questions = (
+        ", counted from the base: turn this joint by hand to one of its stops",
+        ": now turn it to its other stop",
+    )
     for number in range(1, len(free) + 1):
         joint = f"joint_{number}"
-        ask(f"{joint}, counted from the base: turn this joint by hand to one of its stops")
-        before = drives.positions()
-        ask(f"{joint}: now turn it to its other stop")
-        after = drives.positions()
-        moved = moved_drive(joint, {each: after[each] - before[each] for each in free}, channel)
-        matches.append(Match(joint, free.pop(moved), by_hand=True))
-        stops.append((min(before[moved], after[moved]), max(before[moved], after[moved])))
+        drive, *ends = _turn_by_hand(joint, questions, free, drives, channel, ask)
+        matches.append(Match(joint, drive, by_hand=True))
+        stops.append((min(ends), max(ends)))
     return matches, stops
 
 
@@ -295,17 +273,29 @@ RATING_FACTOR = 2.5
 def match_drives(
     arm: ArmFile, drives: FoundDrives, bus: str, ask: Ask | None
 ) -> tuple[list[Match], list[SetupFinding]]:
-    """The drive of every joint: with `ask` each joint is turned by hand, else the order of ids counts.
+    """The drive of every joint: by the order of ids or, with `ask`, by turning each joint by hand from stop to stop.
 
+    Direction and angle are then compared with the model's: another gear is a finding, and so is a turned sign of a
+    CANopen drive, where it is set in the drive. Of other families direction and zero become keys of the arm file.
     Raises BusFault, BadInput.
     """
     if ask is None:
         return match_in_order(arm.joint_names, drives, bus), []
-    known = gcomp_arm(arm)
-    settings = [joint.settings for joint in arm.require_link().joints]
-    gears = [1.0 if each.family == "canopen" else each.gear for each in settings]
-    turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, gears, strict=True)]
-    return match_by_hand(turned, drives, bus, ask)
+    _require(arm.joint_names, drives.found, bus)
+    known, free = gcomp_arm(arm), {each.address: each for each in drives.found}
+    matches, findings = [], []
+    for joint, lower, upper in zip(arm.require_link().joints, known.lower, known.upper, strict=True):
+        to_lower = f": turn this joint by hand to its lower stop ({lower:+.2f} rad)"
+        questions = to_lower, f": now turn it to its upper stop ({upper:+.2f} rad)"
+        drive, low, high = _turn_by_hand(joint.name, questions, free, drives, bus, ask)
+        if drive.family != "canopen":
+            ratio = (high - low) / (upper - lower)
+            zero = round(float(low - ratio * lower), 4)
+            drive = replace(drive, drive={**(drive.drive or {}), "direction": 1 if ratio > 0 else -1, "zero": zero})
+        matches.append(Match(joint.name, drive, by_hand=True))
+        gear = 1.0 if joint.settings.family == "canopen" else joint.settings.gear
+        findings += _judge(joint.name, drive, gear, upper - lower, high - low)
+    return matches, findings
 
 
 def drives_have_ids(arm: ArmFile) -> bool:

@@ -96,8 +96,6 @@ class Questions(Protocol):
 
 @dataclass
 class NewArm:
-    """An arm file about to be written, and how it came about."""
-
     out: Path
     draft: Draft
     findings: list[SetupFinding] = field(default_factory=list)

@@ -22,18 +22,58 @@ RETRY_SECONDS = 1.0
 """Time from a failure of a disk or a database to the next attempt [s]."""
 
 
-class RunAside(Protocol):
-    """Runs work that waits in another thread, in the order in which it is given."""
+class Worker:
+    """Does work that waits in one thread, in its order; the outcomes come back on the event loop in the same order.
+
+    The thread ends with the process: work that never returns keeps nobody from ending.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, name: str, do: Callable[[Callable[[], Any]], Any] = lambda work: work()
+    ) -> None:
+        """`do` is what the thread does with a piece of work."""
+        self._loop, self._do = loop, do
+        self._work = SimpleQueue[tuple[Callable[[], Any], Callable[[Any], None]]]()
+        self._outcomes = deque[Callable[[], None]]()
+        self._unfinished = 0
+        """Work that was given and whose outcome was not."""
+        self._finished = threading.Condition()
+        threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """Call `done` on the service's own thread with the value that `work` returned, or the error it raised."""
+        """Have `work` done, then call `done` with its value or the error it raised. Returns at once; for the loop's
+        thread only."""
+        self._unfinished += 1
+        self._work.put((work, done))
 
+    def drain(self, seconds: float) -> bool:
+        """Wait until all work is done, at most so long [s]; whether it is. For the loop's thread, at its end."""
+        end = time.monotonic() + seconds
+        while self._unfinished:
+            with self._finished:
+                if not self._finished.wait_for(lambda: self._outcomes, max(0.0, end - time.monotonic())):
+                    return False
+            self._deliver()
+        return True
 
-class Disk(RunAside, Protocol):
-    """Likewise all work on the state directory: the only thread that writes there."""
+    def _run(self) -> None:
+        while True:
+            work, done = self._work.get()
+            try:
+                outcome: Any = self._do(work)
+            except Exception as error:
+                outcome = error
+            with self._finished:
+                self._outcomes.append(lambda done=done, outcome=outcome: done(outcome))  # type: ignore[misc]
+                self._finished.notify()
+            del work, done, outcome  # nothing is held while the thread waits
+            with suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(self._deliver)
 
-    def drain(self, seconds: float, /) -> bool:
-        """Wait until all work is done, at most so long [s]; whether it is."""
+    def _deliver(self) -> None:
+        while self._outcomes:
+            self._unfinished -= 1
+            self._outcomes.popleft()()
 
 
 class BusAccess(Protocol):
@@ -53,18 +93,19 @@ class Environment:
     """[s]"""
     wall: Callable[[], datetime]
     """With time zone."""
-    run: RunAside
+    run: Worker
     """For bus and record store."""
     port: BusAccess
-    disk: Disk
-    aside: RunAside
+    disk: Worker
+    """For all work on the state directory: the only thread that writes there."""
+    aside: Worker
     """For work that takes seconds and can be pickled."""
 
 
 class BusJobs:
     """`busy` while a job is under way; the calibration in the controllers may change during that time."""
 
-    def __init__(self, run: RunAside) -> None:
+    def __init__(self, run: Worker) -> None:
         self.busy = False
         self._run = run
 
@@ -88,53 +129,3 @@ def _finish(outcome: T | Exception, done: Callable[[T | ArmlinkError], None]) ->
     if isinstance(outcome, Exception) and not isinstance(outcome, ArmlinkError):
         raise outcome
     done(outcome)
-
-
-class Worker:
-    """`RunAside` of an event loop: work in its order in one thread, the outcomes back on the loop in the same order.
-
-    The thread ends with the process: work that never returns keeps nobody from ending.
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, name: str) -> None:
-        self._loop = loop
-        self._work = SimpleQueue[tuple[Callable[[], Any], Callable[[Any], None]]]()
-        self._outcomes = deque[Callable[[], None]]()
-        self._unfinished = 0
-        """Work that was given and whose outcome was not."""
-        self._finished = threading.Condition()
-        threading.Thread(target=self._run, name=name, daemon=True).start()
-
-    def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """Returns at once; for the loop's thread only."""
-        self._unfinished += 1
-        self._work.put((work, done))
-
-    def drain(self, seconds: float) -> bool:
-        """Wait until all work is done, at most so long [s]; whether it is. For the loop's thread, at its end."""
-        end = time.monotonic() + seconds
-        while self._unfinished:
-            with self._finished:
-                if not self._finished.wait_for(lambda: self._outcomes, max(0.0, end - time.monotonic())):
-                    return False
-            self._deliver()
-        return True
-
-    def _run(self) -> None:
-        while True:
-            work, done = self._work.get()
-            try:
-                outcome: Any = work()
-            except Exception as error:
-                outcome = error
-            with self._finished:
-                self._outcomes.append(lambda done=done, outcome=outcome: done(outcome))  # type: ignore[misc]
-                self._finished.notify()
-            del work, done, outcome  # nothing is held while the thread waits
-            with suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._deliver)
-
-    def _deliver(self) -> None:
-        while self._outcomes:
-            self._unfinished -= 1
-            self._outcomes.popleft()()

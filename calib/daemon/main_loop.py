@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
@@ -33,8 +32,6 @@ from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection, Options
 from calib.records.store import RecordStore
-
-T = TypeVar("T")
 
 
 class Notifier:
@@ -80,12 +77,12 @@ def watchdog_seconds() -> float | None:
 
 SILENT_SECONDS = 15.0
 """A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
+BEGIN_SECONDS = 2 * SILENT_SECONDS
+"""Time for a new bus process to send its first message [s]."""
 PAUSE_SECONDS = 2.0
 """A timer of this process that is later than this says nothing of the bus process [s]."""
 AGAIN_SECONDS = 5.0
 """Time to the next attempt where the system gives no process [s]."""
-BEGIN_SECONDS = 30.0
-"""Time for a new bus process to send its first message [s]."""
 SIGN_OF_LIFE_SECONDS = 1.0
 """Between two signs of life to systemd, unless its watchdog wants them sooner [s]."""
 SWITCH_SECONDS = 0.001
@@ -106,9 +103,9 @@ class Daemon:
         port = _CurrentProcess(lambda: self.process)
         self._disk = Worker(self._loop, "disk")
         self._store, self._records_and_bus = RecordStore(options.store), Worker(self._loop, "records and bus")
-        self._calculations = Worker(self._loop, "calculations")
+        calculations = Worker(self._loop, "calculations", in_process)
         environment = Environment(
-            time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk, self._aside
+            time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk, calculations
         )
         settings = options.settings(arm)
         self.service = Service(arm, settings, options.listen_only, state, self._store, environment)
@@ -119,9 +116,6 @@ class Daemon:
         self._presses = Presses()
         self._bus_ends, self._replacing = Worker(self._loop, "end of the bus process"), False
         """Waits for a bus process that brings its arm to the end; whether another one is to take its place."""
-
-    def _aside(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        self._calculations(lambda: in_process(work), done)
 
     async def run(self) -> None:
         """Run until SIGTERM, SIGINT or SIGQUIT; then the arm comes to its end (`armlink.link.ends`), however long that

@@ -16,8 +16,6 @@ class Rate:
 
 
 class RateLimit:
-    """A bucket of tokens for each key."""
-
     def __init__(self, rate: Rate) -> None:
         self.rate = rate
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()

@@ -3,7 +3,7 @@
 Each part holds its own state and calls only parts further down:
 
     ActiveRecords          records in force, and whether the controllers hold them
-    Observation            one observer against one pair of records: ObserverFeed
+    ObserverFeed           one observer against one pair of records
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
     ExternalTorque         what neither arm nor friction explains, and contacts
     DailyDiagnosis         the day's busiest minute, diagnosed by a process of its own; what wears
@@ -26,15 +26,15 @@ from calib.daemon.environment import CLOSING_SECONDS, BusJobs, Environment
 from calib.daemon.observation.active_records import ActiveRecords
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.observation.external_torque import ExternalTorque
-from calib.daemon.observation.observation import ActiveObservation, ObserverFeed, ObserverStorage
+from calib.daemon.observation.observation import ObserverFeed, ObserverStorage
 from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState, BusiestMinute, LiveWindow, Recordings
-from calib.daemon.state.events import EventLog, Hub
+from calib.daemon.state.events import EventLog, describe, one_alarm_a_joint
 from calib.daemon.state.journal import Journal
-from calib.daemon.view import State
-from calib.observer.decision import DriftFinding
+from calib.daemon.view import Hub, State
+from calib.observer.decision import DriftFinding, Event
 from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
@@ -85,9 +85,8 @@ class Service:
             self.configuration, store, self.arm_state, self.journal, self.events, self.jobs, monotonic
         )
         self.tours = PoseTours(self.configuration, self.events, environment, lambda: self.state)
-        self.records = ActiveRecords(
-            self.configuration, environment, store, self.arm_state, self.events, self.jobs, self._observe
-        )
+        parts = self.configuration, environment, store, self.arm_state, self.events, self.jobs, self.recalibrations
+        self.records = ActiveRecords(*parts, self._observe)
         text = f"armlink {version('armlink')} for {arm.name} {arm.serial}"
         self.events.say("started", None, text, {"policy": settings.policy})
         self._say_set_aside()
@@ -98,7 +97,7 @@ class Service:
         connected = self.arm_state.connected
         if self.jobs.busy:
             return State.RECALIBRATING
-        if connected is None or (connected and self.records.observation is None):
+        if connected is None or (connected and self.records.feed is None):
             return State.STARTING
         if not connected or self.arm_state.silent:
             return State.FAULT
@@ -117,12 +116,8 @@ class Service:
             if self.configuration.settings.diagnosis.enabled:
                 self.busiest.append(message)
             self.tours.heard(message)
-            if self.records.observation is not None:
-                if self.jobs.busy:
-                    self.external.interrupt()
-                else:
-                    self.external.take(message, self.records.observation.feed)
-                self.records.observation.handle(message)
+            if self.records.feed is not None:
+                self._feed(self.records.feed, message)
         elif isinstance(message, Up):
             self.arm_state.up()
             self.arm_state.uncalibrated = message.uncalibrated
@@ -141,8 +136,7 @@ class Service:
         self._say_set_aside()
         for part in (self.events, self.arm_state, self.records, self.recalibrations, self.tours, self.diagnosis):
             part.tick()
-        observation = self.records.observation
-        self.storage.tick(None if observation is None else observation.feed)
+        self.storage.tick(self.records.feed)
         if not self._looks_for_report:
             self._looks_for_report = True
             self.environment.disk(lambda: _newest_report(self.directory), self._report_found)
@@ -163,14 +157,12 @@ class Service:
             raise
         self.events.say("configuration", None, "the configuration was reloaded", {"policy": settings.policy})
         self.records.load()
-        if self.records.observation is not None:
-            feed = self.records.observation.feed
-            self.external.renew(feed.calibration, feed.gravity)
+        if self.records.feed is not None:
+            self.external.renew(self.records.feed.calibration, self.records.feed.gravity)
 
     def save(self, history: bool = False) -> None:
-        """Save the observer's state now and, if asked for, a point of history."""
-        if self.records.observation is not None:
-            self.storage.save(self.records.observation.feed, history)
+        if self.records.feed is not None:
+            self.storage.save(self.records.feed, history)
 
     def close(self, why: str) -> None:
         """Save everything and end, within FLUSH_SECONDS and CLOSING_SECONDS: what is not on disk by then is lost."""
@@ -204,9 +196,37 @@ class Service:
         self.save()
         self.records.renew()
 
-    def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> ActiveObservation:
-        """An observation against these records, continued from the saved state if that fits; raises Refused."""
-        configuration, before = self.configuration, self.records.observation
+    def _feed(self, feed: ObserverFeed, batch: Batch) -> None:
+        """Give samples to all that observes them, unless the calibration changes under these readings."""
+        samples = feed.decimate(batch)
+        if self.jobs.busy:
+            self.external.interrupt()
+            return
+        self.external.take(batch, feed)
+        events = feed.observe(samples, batch.temperature, self.events.now())
+        if events:
+            self._report(feed, events)
+        self.recalibrations.watch(samples, feed.observer.held)
+
+    def _report(self, feed: ObserverFeed, events: list[Event]) -> None:
+        """Keep events and estimates together, then act on the findings."""
+        described = [(event, *describe(event)) for event in one_alarm_a_joint(events)]
+        with self.journal.transaction():
+            for event, kind, text, evidence in described:
+                self.events.say(kind, event.joint, text, evidence)
+            self.storage.save(feed, history=True)
+        for event, kind, _, _ in described:
+            if event.kind == "verdict":
+                self.recalibrations.explained(kind, event.joint)
+        for event in events:
+            if event.finding is not None:
+                self.recalibrations.found(event.finding)
+            elif event.kind == "undecided":
+                self.tours.wish("the readings so far cannot decide on the cause")
+
+    def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> ObserverFeed:
+        """The observer against these records, continued from the saved state if that fits; raises Refused."""
+        configuration, before = self.configuration, self.records.feed
         arm = configuration.arm
         feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer)
         recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, calibration)
@@ -216,13 +236,10 @@ class Service:
             self.storage.save(feed, history=True)
 
         self.storage.restore(feed, self.recalibrations.begin(recalibrator, installed))
-        observation = ActiveObservation(
-            feed, self.recalibrations, self.storage, self.journal, self.events, self.jobs, self.tours.wish
-        )
         if before is not None:
-            observation.last_accepted = before.last_accepted
+            feed.last_accepted = before.last_accepted
         self.external.renew(feed.calibration, feed.gravity)
-        return observation
+        return feed
 
 
 def _newest_report(directory: Path) -> Path | None:

@@ -13,12 +13,11 @@ from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
 from calib.arm.kinematics import frame_origins, gcomp_arm, model_arm, model_chain
 from calib.daemon import view
-from calib.daemon.observation.observation import ActiveObservation
+from calib.daemon.observation.observation import ObserverFeed
 from calib.daemon.service import Service
 from calib.daemon.state.arm_state import LONGEST_PAUSE
-from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
-from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from calib.daemon.view import Client, DrawnArm, DrawnJoint, NoSuch, Window
 from calib.external.listening import LiveExternal
 from calib.external.tables import wrench_of
 from gcomp.arm.arm import Arm, bar_rotations
@@ -34,14 +33,14 @@ class ServiceView:
         self._service, self._version = service, version("armlink")
         self._history = HistoryReader(service.journal.path)
         self._arm: view.DrawnArm | None = None
-        self.decisions: Decisions = service.recalibrations
+        self.approve, self.reject = service.recalibrations.approve, service.recalibrations.reject
 
     @property
-    def _observation(self) -> ActiveObservation | None:
-        return self._service.records.observation
+    def _feed(self) -> ObserverFeed | None:
+        return self._service.records.feed
 
     def status(self) -> view.Status:
-        service, observation = self._service, self._observation
+        service, feed = self._service, self._feed
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
         return view.Status(
             state=service.state,
@@ -56,12 +55,12 @@ class ServiceView:
             uptime_s=now - service.started,
             bus=self._bus(),
             records=view.RecordsInForce(
-                calibration=None if observation is None else observation.feed.calibration.id,
-                gravity=None if observation is None else observation.feed.gravity.id,
+                calibration=None if feed is None else feed.calibration.id,
+                gravity=None if feed is None else feed.gravity.id,
             ),
             uncalibrated=arm_state.uncalibrated,
-            held=observation is not None and observation.feed.observer.held,
-            rows=0 if observation is None else observation.feed.observer.rows,
+            held=feed is not None and feed.observer.held,
+            rows=0 if feed is None else feed.observer.rows,
             pending_proposals=service.journal.pending(),
             store_fault=service.records.store_fault or None,
             journal_fault=service.journal.trouble or None,
@@ -151,17 +150,17 @@ class ServiceView:
     def _torques(self, position: Array, torque: Array) -> tuple[Array, Array]:
         """Torques (K, n) as sent, converted to the record in force, and the model's at these positions; NaN without."""
         model = np.full(position.shape, math.nan)
-        if self._observation is not None:
-            torque = self._observation.feed.reading(torque)
+        if self._feed is not None:
+            torque = self._feed.reading(torque)
             known = np.isfinite(position).all(axis=1)
             if known.any():
-                model[known] = self._observation.feed.observer.model_torque(position[known])
+                model[known] = self._feed.observer.model_torque(position[known])
         return torque, model
 
     def estimates(self) -> tuple[view.JointEstimate, ...]:
-        if self._observation is None:
+        feed = self._feed
+        if feed is None:
             return ()
-        feed, last_accepted = self._observation.feed, self._observation.last_accepted
         estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
@@ -172,7 +171,7 @@ class ServiceView:
                 offset=estimate.offset[j],
                 offset_std=estimate.offset_std[j],
                 samples=estimate.accepted[j],
-                last_accepted=last_accepted.get(name),
+                last_accepted=feed.last_accepted.get(name),
                 installed_gain=gain[j],
                 installed_offset=offset[j],
                 gain_limit=limits.gain[j],

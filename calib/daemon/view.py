@@ -4,6 +4,7 @@ All calls but those for events, history and the arm's shape are made on the serv
 thread); no answer waits for bus or disk.
 """
 
+import asyncio
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -378,35 +379,51 @@ class NotYet(Exception):
     """A decision that is taken, but not on disk yet; the message says so (HTTP 503)."""
 
 
-class Decisions(Protocol):
-    """Decisions that a person may take through the API. Raises NoSuch, NotPossible.
+class Client(asyncio.Queue[StreamItem]):
+    """One client's items: those of five seconds of joints; used on the event loop's thread only.
 
-    The answer is there once the decision is on disk; it stands even if nobody waits for that.
+    A client that is too slow loses the oldest ones and never delays the daemon.
     """
 
-    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
-        """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
+    def __init__(self, hub: "Hub") -> None:
+        super().__init__(maxsize=50)
+        self._hub = hub
 
-        It is `approved` once that is on disk, and `applied` or `failed` a moment later (an event).
-        """
+    def add(self, item: StreamItem) -> None:
+        if self.full():
+            self.get_nowait()
+        self.put_nowait(item)
 
-    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
-        """Drop a pending proposal; `digest` likewise."""
+    def close(self) -> None:
+        self._hub.clients.discard(self)
 
 
-class Subscription(Protocol):
-    """One client's stream: bounded; a client that is too slow loses the oldest items and never delays the daemon."""
+class Hub:
+    def __init__(self) -> None:
+        self.clients: set[Client] = set()
 
-    async def get(self) -> JointsItem | EventItem: ...
+    def subscribe(self) -> Client:
+        client = Client(self)
+        self.clients.add(client)
+        return client
 
-    def close(self) -> None: ...
+    def publish(self, item: StreamItem) -> None:
+        for client in self.clients:
+            client.add(item)
 
 
 class DaemonView(Protocol):
     """Everything that the web layer can reach. Nothing here commands torque or motion."""
 
-    @property
-    def decisions(self) -> Decisions: ...
+    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
+
+        It is `approved` once that is on disk, which is when the answer is there, and `applied` or `failed` a moment
+        later (an event). The decision stands even if nobody waits for the answer. Raises NoSuch, NotPossible.
+        """
+
+    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Drop a pending proposal; likewise."""
 
     def status(self) -> Status: ...
 
@@ -442,5 +459,5 @@ class DaemonView(Protocol):
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]: ...
 
-    def subscribe(self) -> Subscription:
+    def subscribe(self) -> Client:
         """A new client of the stream, which begins with the present joints."""

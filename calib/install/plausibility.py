@@ -23,12 +23,12 @@ LARGEST_OFFSET = 0.5
 """Largest offset of a working sensor, as a share of rated torque: beyond, half of its range is lost on one side."""
 USUAL = {"gain": 0.02, "offset": 0.02}
 """Standard deviation of a change between two calibrations before there is history: gain as a ratio, offset as a share
-of rated torque. DEVIATIONS times that is LARGEST_DRIFT."""
+of rated torque."""
 USUAL_COUNTS = 4
 """Number of past changes that USUAL weighs as much as: history dominates from the fifth change on."""
 DEVIATIONS = 5.0
 """Largest change in standard deviations of covariance and history; 10 % of gain without history."""
-LARGEST_DRIFT = 0.1
+LARGEST_DRIFT = DEVIATIONS * USUAL["gain"]
 """Largest change that is a drift and not a broken or exchanged sensor: of a gain as a ratio, of an offset as a share of
 rated torque (docs/theory.md, section 6.6)."""
 NOT_BY_CHANCE = 3.0
@@ -59,8 +59,6 @@ class Refusal(Enum):
 
 
 class GateRefused(Refused):
-    """A gate refuses a record; nothing was written."""
-
     def __init__(self, refusal: Refusal, joint: str, **values: object) -> None:
         """`values` fill in the refusal's text."""
         super().__init__(f"{joint}: {refusal.value.format(joint=joint, **values)}; nothing was written")

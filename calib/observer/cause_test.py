@@ -22,8 +22,6 @@ INEXACT = 0.02
 """Most that an effect's own shape may be off, as a share: it is as inexact as the gravity model's torque."""
 LEVEL_ROWS = 10
 """Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
-MOST_GAIN_LIMIT = 1.0
-"""A gain whose limit is above this is not observed: gravity hardly loads the joint."""
 MISFIT = 4.0
 """(χ² − dof)/√(2 dof) above which no entry explains the window (docs/theory.md, section 6)."""
 
@@ -250,5 +248,5 @@ def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimit
     count, n = test.window.position.shape
     longer = np.sqrt(LONGEST_WINDOW / count)
     gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
-    gain[~(gain <= MOST_GAIN_LIMIT)] = np.nan
+    gain[~(gain <= 1.0)] = np.nan  # gravity hardly loads the joint: not even a gain of 0 would be noticed
     return DetectionLimits(gain, offset, wait + LONGEST_WINDOW + 2 * config.window)

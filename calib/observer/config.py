@@ -23,6 +23,8 @@ for an alarm."""
 LONGEST_WINDOW = 60
 """Rows kept for an ambiguous test and for the final estimate (§6: gain to 0.03–0.07 % on well-loaded joints); also rows
 that show whether a gain can be told, and poses remembered."""
+PLACE_SIZE = 0.2
+"""Poses within this distance in every joint count as one pose, and rows of a joint as neighbours [rad]."""
 
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]

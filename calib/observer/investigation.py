@@ -10,11 +10,11 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, PLACE_SIZE, ObserverConfig
 from calib.observer.decision import Agreeing
 from calib.observer.evidence import Verdict
 from calib.observer.saved_values import read_rows, save_rows
-from calib.observer.tracking import PLACE_ROWS, PLACE_SIZE, Tracking
+from calib.observer.tracking import PLACE_ROWS, Tracking
 
 
 class Investigation:

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
 from calib.motion.static_reading import LEAST_SAMPLES, slope
-from calib.observer.config import LONGEST_GAP
+from calib.observer.config import LONGEST_GAP, PLACE_SIZE
 from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque, Parameter
 from gcomp.arm.arm import Arm
@@ -132,8 +132,6 @@ ALIKE = 2.0
 is measured."""
 FITTED = 5
 """Rows of a joint that its own parameters take up."""
-NEIGHBOUR_DISTANCE = 0.2
-"""Rows of a joint are neighbours if it moved less between them [rad]."""
 UNKNOWN_WARMTH_STD = 0.01
 """Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
 KNOWN_WARMTH_STD = 5e-4
@@ -238,7 +236,7 @@ class MotorBelief:
             own = np.flatnonzero(model.joint == j)
             square = residual[own] ** 2
             variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
-            near = np.abs(np.diff(model.readings.position[own, j])) < NEIGHBOUR_DISTANCE
+            near = np.abs(np.diff(model.readings.position[own, j])) < PLACE_SIZE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
         return found

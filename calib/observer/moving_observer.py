@@ -42,8 +42,6 @@ NOTHING = np.zeros(2), np.diag(UNSEEN_STD**2)
 
 
 class ChangeTest:
-    """The candidates fitted to K rows."""
-
     def __init__(self, belief: MotorBelief, passages: Sequence[Passage]) -> None:
         """Rows after those that the belief rests on."""
         self._belief, self._passages = belief, passages
@@ -149,14 +147,14 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     return found
 
 
-REFERENCE = 360
-"""Rows without a change that the belief is learned from: four minutes of creeping."""
 LONGEST = 2 * LONGEST_WINDOW
 """Rows of a test at most: the latest. There is one after each LONGEST_WINDOW rows: of seven joints that creep in turn,
 40 s."""
+REFERENCE = 3 * LONGEST
+"""Rows without a change that the belief is learned from: four minutes of creeping."""
 AGREEING = 2
 """Tests in a row that must say the same until it is an event."""
-UNEXPLAINED = 3
+UNEXPLAINED = AGREEING + 1
 """The same of tests that nothing explains: the first ones after a change have rows of before it."""
 SCHEMA = "moving/1"
 
@@ -167,8 +165,7 @@ class MovingObserver:
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated_torque: Array) -> None:
         """Against records of creep sweeps; rated_torque (n,) [N·m]."""
         self.arm = arm
-        self._position_gain = calibration.values("position_gain", 1.0)
-        self._position_offset = calibration.values("position_offset", 0.0)
+        self._angle = calibration.angle
         self._detector = PassageDetector(arm.n)
         self._belief = MotorBelief(arm, calibration, gravity, np.asarray(rated_torque, dtype=float))
         self._block: list[Passage] = []
@@ -200,7 +197,6 @@ class MovingObserver:
         return events
 
     def handle_row(self, passage: Passage) -> list[Event]:
-        """Take one row, with true angles."""
         self._count[passage.joint] += 1
         self._block.append(passage)
         if len(self._block) < LONGEST_WINDOW:
@@ -274,9 +270,6 @@ class MovingObserver:
         self._block, self._recent, self._count = block, recent, count
         self._reported, self._tested = reported, None
         return True
-
-    def _angle(self, position: Array) -> Array:
-        return np.asarray(self._position_gain * position + self._position_offset)
 
     def _test(self) -> ChangeTest | None:
         """The test of the latest rows; None while there are too few."""

@@ -4,6 +4,7 @@ Pure: samples in, events out; no bus, clock, file or thread. Readings are those 
 estimate is relative to it: reading = gain·τ + offset, with gain 1 and offset 0 while nothing has drifted.
 """
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -45,19 +46,18 @@ class Observer:
         beta_covariance: Array,
         sigma: Array,
         config: ObserverConfig | None = None,
-        position_gain: Array | None = None,
-        position_offset: Array | None = None,
+        angle: Callable[[Array], Array] = lambda reading: reading,
         level: DiscrepancyLevel | None = None,
     ) -> None:
         """Watch an arm.
 
         beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
-        deviation of one averaged torque reading to begin with, replaced by the measured one; position gains and offsets
-        (n,) of the calibration record; level of the discrepancy that the calibration left, if it said.
+        deviation of one averaged torque reading to begin with, replaced by the measured one; `angle` makes joint
+        angles of position readings, as the calibration record does; level of the discrepancy that the calibration left,
+        if it said.
         """
         self.arm, self.config = arm, config or ObserverConfig()
-        self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
-        self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
+        self._angle = angle
         self._rest = RestDetector(arm.n, self.config)
         rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
         expected = level or DiscrepancyLevel.expected(DISCREPANCY_SHARE * rated)
@@ -76,7 +76,6 @@ class Observer:
 
     @property
     def accepted(self) -> Array:
-        """Rows that went into each joint's estimate (n,)."""
         return self._tracking.filter.accepted.copy()
 
     @property
@@ -149,9 +148,6 @@ class Observer:
             return False
         self._tracking, self._rest, self._investigation = tracking, rest, investigation
         return True
-
-    def _angle(self, position: Array) -> Array:
-        return np.asarray(self._position_gain * position + self._position_offset)
 
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
@@ -290,7 +286,6 @@ def observer_of(
     if any(joint.motor is not None for joint in calibration.joints):
         return MovingObserver(arm, calibration, gravity, rated_torque)
     config, rated = config or ObserverConfig(), np.asarray(rated_torque, dtype=float)
-    position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
     level = DiscrepancyLevel.of_record(calibration, DISCREPANCY_SHARE * rated)
     beta, covariance = np.array(gravity.beta), np.array(gravity.covariance)
-    return Observer(arm, beta, covariance, config.noise_share * rated, config, *position, level)
+    return Observer(arm, beta, covariance, config.noise_share * rated, config, calibration.angle, level)

@@ -137,8 +137,6 @@ def recalibrated_record(
 
 
 class Recalibrator:
-    """Turns findings into records, and writes them."""
-
     def __init__(
         self, arm: ArmFile, controllers: Controllers, store: RecordStore, current: CalibrationRecord | None = None
     ) -> None:
@@ -152,6 +150,11 @@ class Recalibrator:
         self._written: tuple[int, ...] = ()
         """Joints of the last write."""
         self._check: AfterWrite | None = None
+
+    @property
+    def checking(self) -> tuple[int, ...]:
+        """Joints of the last write, while `sample` checks it."""
+        return () if self._check is None else self._written
 
     def recalibrate(self, finding: DriftFinding) -> Recalibration:
         """Propose and apply at once. Raises Refused, BusFault."""

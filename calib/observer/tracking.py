@@ -13,7 +13,14 @@ import numpy as np
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest, DetectionLimits, limits
-from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
+from calib.observer.config import (
+    AUDIT_ROWS,
+    INITIAL_GAIN_STD,
+    INITIAL_OFFSET_STD,
+    LONGEST_WINDOW,
+    PLACE_SIZE,
+    ObserverConfig,
+)
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
@@ -159,7 +166,6 @@ class Cusum:
         self._sums[at], self._rising[at] = 0.0, 0
 
     def save(self) -> dict[str, Any]:
-        """The sums and how long they have been rising, as JSON values."""
         return {"sums": self._sums.tolist(), "rising": self._rising.tolist()}
 
     def restore(self, values: dict[str, Any]) -> None:
@@ -168,8 +174,6 @@ class Cusum:
         self._rising = as_array("rising", values.get("rising", unknown), shape).astype(int)
 
 
-PLACE_SIZE = 0.2
-"""Poses within this distance in every joint count as one pose [rad]."""
 PLACE_ROWS = 3
 """Rows of one pose that the filter and a window take: a repeated pose adds no information."""
 PLACE_MEMORY = 20
@@ -220,7 +224,6 @@ class PoseMemory:
         self._position, self._mean, self._count = self._position[:0], self._mean[:0], self._count[:0]
 
     def save(self) -> dict[str, Any]:
-        """Poses, mean residuals and counts as JSON values."""
         return {"places": [self._position.tolist(), self._mean.tolist(), self._count.tolist()]}
 
     def restore(self, values: dict[str, Any]) -> None:

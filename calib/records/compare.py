@@ -1,12 +1,13 @@
 """Differences between two records of one arm, per joint, in units and in standard deviations."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from armlink.errors import BadInput, Refused
 from calib.records.records import PARAMETERS, CalibrationRecord, GravityRecord
-from gcomp.arrays import Array
 
 UNITS = {"gain": "1", "offset": "N·m", "position_gain": "1", "position_offset": "rad", "x": "kg·m", "y": "kg·m"}
 
@@ -53,44 +54,34 @@ def differences(
             raise Refused(
                 f"records {before.id} and {after.id}: {name} {ours[:12]} and {theirs[:12]} have nothing in common"
             )
-    if isinstance(before, CalibrationRecord) and isinstance(after, CalibrationRecord):
-        return _of_calibration(before, after)
-    if isinstance(before, GravityRecord) and isinstance(after, GravityRecord):
-        return _of_gravity(before, after)
-    raise BadInput(
-        f"{before.id} is a {before.kind} record and {after.id} a {after.kind} record: give two records of one kind"
-    )
+    if before.kind != after.kind:
+        raise BadInput(
+            f"{before.id} is a {before.kind} record and {after.id} a {after.kind} record: give two records of one kind"
+        )
+    pairs = zip(_parameters(before), _parameters(after), strict=True)
+    return [_change(joint, name, old, new) for (joint, name, *old), (_, _, *new) in pairs]
 
 
-def _of_calibration(before: CalibrationRecord, after: CalibrationRecord) -> list[ParameterChange]:
-    stds = {name: (before.std(name), after.std(name)) for name in PARAMETERS}
-    values = {name: (before.values(name), after.values(name)) for name in PARAMETERS}
-    return [
-        _change(joint.name, name, *(side[j] for side in values[name]), *(side[j] for side in stds[name]))
-        for j, joint in enumerate(before.joints)
-        for name in PARAMETERS
-    ]
-
-
-def _of_gravity(before: GravityRecord, after: GravityRecord) -> list[ParameterChange]:
-    (old, old_std), (new, new_std) = (_moments(record) for record in (before, after))
-    return [
-        _change(name, axis, old[2 * j + k], new[2 * j + k], old_std[2 * j + k], new_std[2 * j + k])
-        for j, name in enumerate(before.names)
-        for k, axis in enumerate(("x", "y"))
-    ]
-
-
-def _moments(record: GravityRecord) -> tuple[Array, Array]:
-    known = np.array(record.identifiable)
+def _parameters(record: CalibrationRecord | GravityRecord) -> Iterator[tuple[str, str, float, float]]:
+    """Joint, parameter, value and standard deviation; NaN for what was not estimated."""
+    if isinstance(record, CalibrationRecord):
+        for j, joint in enumerate(record.joints):
+            for name in PARAMETERS:
+                yield joint.name, name, float(record.values(name)[j]), float(record.std(name)[j])
+        return
     spread = np.sqrt(np.maximum(np.diag(np.array(record.covariance)), 0.0))
-    return np.where(known, np.array(record.beta), np.nan), np.where(known, spread, np.nan)
+    known = np.array(record.identifiable)
+    values, stds = np.where(known, record.beta, np.nan).tolist(), np.where(known, spread, np.nan).tolist()
+    for (joint_name, axis), value, std in zip(product(record.names, "xy"), values, stds, strict=True):
+        yield joint_name, axis, value, std
 
 
-def _change(joint: str, name: str, before: float, after: float, std_before: float, std_after: float) -> ParameterChange:
+def _change(joint: str, name: str, old: list[float], new: list[float]) -> ParameterChange:
+    """From value and standard deviation, old and new."""
+    (before, std_before), (after, std_after) = old, new
     spread = float(np.sqrt(np.nansum([std_before**2, std_after**2])))
     return ParameterChange(joint, name, UNITS[name], _number(before), _number(after), spread or None)
 
 
 def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+    return None if np.isnan(value) else value

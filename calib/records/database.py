@@ -66,14 +66,14 @@ def append_only(table: str, dialect: str) -> list[str]:
 
 
 HEAD = MIGRATIONS[-1]
-BUSY_SECONDS = 10
-"""Wait for another writer of an SQLite store [s]."""
+ANSWER_SECONDS = 10
+"""Longest wait for a database: for another writer of an SQLite file, or for a server's answer [s]."""
 _POSTGRESQL = {
     "connect_timeout": 5,
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
-    "options": "-c statement_timeout=10000",
+    "options": f"-c statement_timeout={ANSWER_SECONDS * 1000}",
 }
 """Of libpq: how long it waits for a connection, and how long the server may work [s, s, s, –, ms]."""
 _VERSION = "alembic_version"
@@ -81,7 +81,7 @@ _FILE = "file"
 """Key of a connection's notes: the identity of the file that it holds open."""
 FileIdentity = tuple[int, int] | None
 """Device and inode; None for a database that is no file of its own."""
-_LOCK = 0x61726D6C
+_LOCK = int.from_bytes(b"arml")
 """Advisory lock on PostgreSQL that serialises writers, as SQLite does by itself."""
 
 
@@ -117,7 +117,7 @@ def open_database(url: str) -> sa.Engine:
         elif connect:
             from calib.records.hanging_server import give_up_when_silent  # psycopg is an extra
 
-            give_up_when_silent(engine)
+            give_up_when_silent(engine, ANSWER_SECONDS)
         _migrate(engine)
     except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
         raise BadInput(f"record store {_shown(full)}: cannot be opened: {first_line(error)}") from None
@@ -279,7 +279,7 @@ def _prepare_sqlite(engine: sa.Engine) -> None:
     @sa.event.listens_for(engine, "connect")
     def _on_connect(connection: Any, pooled: Any) -> None:
         connection.isolation_level = None  # pysqlite would begin by itself, and too late
-        connection.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000}")
+        connection.execute(f"PRAGMA busy_timeout={ANSWER_SECONDS * 1000}")
         _to_one_file(connection)
         for pragma in ("synchronous=FULL", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")

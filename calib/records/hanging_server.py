@@ -13,16 +13,16 @@ from typing import Any
 import psycopg
 import sqlalchemy as sa
 
-SILENT_SECONDS = 10.0
-"""A server that answers nothing for this time has gone [s]."""
-
 
 class ImpatientConnection(psycopg.Connection[Any]):
     """Raises psycopg.OperationalError, and is of no more use, where the server does not answer in time."""
 
+    patience: float
+    """Longest wait for an answer [s]."""
+
     def wait(self, *given: Any, **options: Any) -> Any:
         """As psycopg's, with an end; all that asks the server goes through here, connecting apart."""
-        seconds, silent = SILENT_SECONDS, threading.Event()
+        seconds, silent = self.patience, threading.Event()
 
         def hang_up() -> None:
             silent.set()
@@ -42,9 +42,11 @@ class ImpatientConnection(psycopg.Connection[Any]):
             timer.cancel()
 
 
-def give_up_when_silent(engine: sa.Engine) -> None:
+def give_up_when_silent(engine: sa.Engine, seconds: float) -> None:
     """Let an engine for PostgreSQL make connections of this kind."""
 
     @sa.event.listens_for(engine, "do_connect")
     def _connect(_dialect: object, _record: object, given: Any, options: Any) -> ImpatientConnection:
-        return ImpatientConnection.connect(*given, **options)
+        connection = ImpatientConnection.connect(*given, **options)
+        connection.patience = seconds
+        return connection

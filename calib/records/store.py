@@ -162,7 +162,6 @@ class RecordStore:
         return log[-1] if log else None
 
     def activations(self, arm: ArmFile) -> list[Activation]:
-        """The activation log of this arm (name and serial), oldest first."""
         log = ACTIVATIONS.c
         wanted = sa.select(log.number, log.record, log.kind, log.at, log.by, log.reason)
         wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)

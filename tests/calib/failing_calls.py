@@ -215,7 +215,7 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "datetime", now)
         readers = SimpleNamespace(add_reader=nothing, remove_reader=nothing)
         patch.setattr(main_loop, "asyncio", SimpleNamespace(get_running_loop=lambda: readers, Event=asyncio.Event))
-        patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
+        patch.setattr(main_loop, "Worker", lambda *_: Immediate())
         patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
         patch.setenv("NOTIFY_SOCKET", "systemd")
@@ -314,7 +314,7 @@ class FailingDaemon(FastDaemon):
         status = self.view.status()
         if status.detail or status.state not in (State.OBSERVING, State.SWEEPING):
             self.wrong.append(f"{now:.1f} s: {status.state} {status.detail}, last failure at {self._failed_at:.1f} s")
-        kept = self.store.current(type(self.service.records.observation.feed.calibration), self.arm)  # type: ignore[union-attr]
+        kept = self.store.current(type(self.service.records.feed.calibration), self.arm)  # type: ignore[union-attr]
         if kept is None or status.records.calibration != kept.id:
             self.wrong.append(
                 f"{now:.1f} s: record {status.records.calibration} in force, the store has {kept and kept.id}"

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class Immediate:
-    """`Disk` for one thread alone: work is done, and its outcome given, before the call returns."""
+    """`Worker` for one thread alone: work is done, and its outcome given, before the call returns."""
 
     def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
         try:

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -58,9 +57,8 @@ class WornMinute:
     def take(self, least: float) -> "WornMinute":
         return self
 
-    def write(self, path: Path, names: tuple[str, ...]) -> Iterator[None]:
+    def write(self, path: Path, names: tuple[str, ...]) -> None:
         worn(path)
-        yield
 
 
 def test_by_command(folder: Path) -> None:

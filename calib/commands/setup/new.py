@@ -1,6 +1,9 @@
 """Makes an arm file from a URDF or MJCF model, and finds its drives on a bus."""
 
+import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,8 +15,13 @@ from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from calib.commissioning.drive_match import Ask
+    from armlink.bus.can_bus import CanBus
+    from armlink.drives.discovery import BusDrives
+    from armlink.drives.findings import SetupFinding
+    from calib.commissioning.drive_match import Ask, Match
     from calib.commissioning.new_arm import NewArm
+
+SCHEMA = "armlink.new/1"
 
 
 def new(
@@ -95,7 +103,6 @@ def new(
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.loop.open import first_check
     from armlink.model_file import expanded
-    from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, exit_status, open_named, rewire, search
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm
@@ -158,13 +165,9 @@ def new(
             questions=asked,
         )
     if bus is not None:
-        opened = open_named(bus)
-        try:
-            drives = search(opened)
-            keys = bus_keys(bus, out, {each.family for each in drives.found})
+        with opened_bus(bus) as opened:
+            drives, keys = search(opened, bus, out)
             made.wire(drives, str(opened.channel_info), hand(by_hand, interactive), keys)
-        finally:
-            opened.shutdown()
     arm = made.parsed()
     made.write()
     _show(results(json_file), made, arm)
@@ -176,7 +179,6 @@ def new(
 
 def _hand(bus: str, by_hand: bool | None, interactive: bool) -> "Ask | None":
     """How a person is asked to turn a joint, on a bus that is there: answers are not lost to another."""
-    from calib.commands.setup.bus_setup import open_named
     from calib.commands.setup.terminal import hand
 
     open_named(bus).shutdown()
@@ -198,7 +200,6 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
 def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
     from rich.table import Table
 
-    from calib.commands.setup.bus_setup import show_findings
     from calib.commissioning.draft import assumed_lines
 
     draft = made.draft
@@ -225,7 +226,6 @@ def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
 
 
 def _answer(made: "NewArm", arm: "ArmFile", step: str) -> dict[str, Any]:
-    from calib.commands.setup.bus_setup import SCHEMA
     from calib.commissioning.drive_match import drive_id
 
     draft = made.draft
@@ -252,3 +252,141 @@ def _answer(made: "NewArm", arm: "ArmFile", step: str) -> dict[str, Any]:
         "findings": [vars(found) for found in made.findings],
         "next": step,
     }
+
+
+def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
+    """An arm file made from a bus alone: it has the drives, but no geometry."""
+    from calib.commissioning.drive_match import arm_of_bus
+
+    with opened_bus(bus) as opened:
+        drives, keys = search(opened, bus, out)
+        text, matches = arm_of_bus(drives, str(opened.channel_info), keys, name or out.stem, ask)
+    arm = _written(out, text)
+    return _tell(out, arm, matches, "; the geometry is not known (see the file)", [], json_file)
+
+
+def rewire(
+    model: Path, out: Path, bus: str, ask: "Ask | None", *, by_ids: bool, bundled: bool, json: Path | None
+) -> int:
+    """An arm file with the drives of a bus; `by_ids`: each drive is asked for its identity at its id in the file.
+
+    A copy of a `bundled` arm takes the serial number of its first drive.
+    """
+    from armlink.arm_file import Bus, load_arm
+    from armlink.content.file_content import read_whole
+    from armlink.content.yaml_text import yaml_comment
+    from calib.commissioning.drive_match import match_by_ids, match_drives, wired_text
+
+    arm = load_arm(model)
+    with opened_bus(bus) as opened:
+        channel = str(opened.channel_info)
+        if by_ids:
+            keys = bus_keys(bus, out, {joint.settings.family for joint in arm.require_link().joints})
+            matches, findings = match_by_ids(arm, opened, Bus.model_validate(keys))
+        else:
+            drives, keys = search(opened, bus, out)
+            matches, findings = match_drives(arm, drives, channel, ask)
+    serial = (matches[0].drive.serial or "unknown") if bundled else ""
+    text, doubts = wired_text(read_whole(model).decode(), arm, matches, out, keys, serial)
+    if out.resolve() != model.resolve():
+        title = f"{arm.name} with the drives on {channel}: made from {model.name} by `armlink new`."
+        text = f"{yaml_comment(title)}\n{text}"
+    arm = _written(out, text)
+    where = "each at the joint with the same id in the file" if by_ids else "in the order of their ids, as assumed"
+    more = "" if all(each.by_hand for each in matches) else f", {where}: --by-hand checks it"
+    return _tell(out, arm, matches, more, findings + doubts, json)
+
+
+def _written(out: Path, text: str) -> "ArmFile":
+    """Write an arm file that can be read."""
+    from armlink.arm_file import parse_arm
+    from armlink.content.atomic_file import write_whole
+    from armlink.content.file_content import parse_yaml
+
+    arm = parse_arm(parse_yaml(text, out), out)
+    write_whole(out, text)
+    return arm
+
+
+def _tell(
+    out: Path,
+    arm: "ArmFile",
+    matches: "Sequence[Match]",
+    more: str,
+    findings: "Sequence[SetupFinding]",
+    json_file: Path | None,
+) -> int:
+    """Findings, what was written and the next command, to the screen and as JSON; the exit status."""
+    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.loop.open import first_check
+    from calib.commissioning.drive_match import addresses
+
+    console = results(json_file)
+    show_findings(console, findings)
+    step = command_line(*first_check(arm, str(out)))
+    console.print(f"{out} is written with {len(matches)} drives: {addresses([each.drive for each in matches])}{more}")
+    suggest(step)
+    joints = [
+        {"name": each.joint, "node": each.drive.node, "by_hand": each.by_hand}
+        | {"address": each.drive.address, "serial": each.drive.serial}
+        for each in matches
+    ]
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [vars(found) for found in findings]})
+    return exit_status(findings)
+
+
+def show_findings(console: Any, findings: "Sequence[SetupFinding]") -> None:
+    for found in findings:
+        console.print(str(found), style="red" if found.level == "error" else "yellow")
+
+
+def exit_status(findings: "Sequence[SetupFinding]") -> int:
+    return 1 if any(found.level == "error" for found in findings) else 0
+
+
+def open_named(bus: str) -> "CanBus":
+    """The bus of the option --bus; raises BadInput, BusFault."""
+    from armlink.arm_file import Bus
+    from armlink.bus.open import open_bus
+
+    return open_bus(bus, Bus())
+
+
+@contextmanager
+def opened_bus(bus: str) -> "Iterator[CanBus]":
+    opened = open_named(bus)
+    try:
+        yield opened
+    finally:
+        opened.shutdown()
+
+
+def search(opened: "CanBus", bus: str, out: Path) -> "tuple[BusDrives, dict[str, Any]]":
+    """The drives on an open bus, and the keys of link.bus; prints the families that were looked for, and settings that
+    must be changed."""
+    from armlink.commands.plain_console import PlainConsole
+    from armlink.drives.discovery import BusDrives
+
+    console = PlainConsole()
+    with console.status(f"looking for drives on {opened.channel_info}"):
+        drives = BusDrives(opened)
+    for line in (drives.told, *(f"{node['address']}: {node['wrong']}" for node in drives.nodes if node["wrong"])):
+        console.print(line)
+    return drives, bus_keys(bus, out, {each.family for each in drives.found})
+
+
+def bus_keys(bus: str, out: Path, families: set[str]) -> dict[str, Any]:
+    """Keys of link.bus for a bus given on the command line, with drives of these families; for a simulated bus, the
+    path of its arm file is relative to `out`."""
+    from armlink.bus.open import parse_bus
+    from armlink.drives.family import family
+
+    parsed = parse_bus(bus)
+    channel = parsed.channel
+    if Path(channel).is_file():
+        channel = os.path.relpath(Path(channel).resolve(), out.resolve().parent)
+    keys: dict[str, Any] = {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}
+    if parsed.fd or any(family(kind).traits.frame == "fd" for kind in families):
+        keys["fd"] = True
+    return keys | ({"options": parsed.options} if parsed.options else {})

@@ -1,7 +1,7 @@
 """Questions of `armlink new` to a person at a terminal, and answers from its options."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from typer import BadParameter
@@ -16,49 +16,42 @@ if TYPE_CHECKING:
     from calib.commissioning.drive_match import Ask
 
 
-def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Stops [rad] by joint from texts JOINT:LOWER:UPPER; raises BadInput."""
+def _numbers(
+    option: str, texts: Sequence[str], count: int, holds: Callable[..., bool], expected: str
+) -> dict[str, list[float]]:
+    """Numbers by joint from texts JOINT:NUMBER…, so many of them, for which `holds`; raises BadInput."""
     found = {}
     for text in texts:
-        joint, lower, upper = ["", *text.rsplit(":", 2)][-3:]
+        joint, *words = text.rsplit(":", count)
         try:
-            low, high = float(lower), float(upper)
+            numbers = [float(word) for word in words]
         except ValueError:
-            joint = ""
-        if not joint or not low < high:
-            raise BadInput(f"--stops {text}: expected JOINT:LOWER:UPPER in rad, such as elbow:-2.1:2.1")
-        found[joint] = (low, high)
+            numbers = []
+        if not joint or len(numbers) != count or not holds(*numbers):
+            raise BadInput(f"{option} {text}: expected {expected}")
+        found[joint] = numbers
     return found
+
+
+def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Stops [rad] by joint from texts JOINT:LOWER:UPPER; raises BadInput."""
+    expected = "JOINT:LOWER:UPPER in rad, such as elbow:-2.1:2.1"
+    found = _numbers("--stops", texts, 2, lambda low, high: low < high, expected)
+    return {joint: (low, high) for joint, (low, high) in found.items()}
 
 
 def parse_ratings(texts: Sequence[str]) -> dict[str, float]:
     """Rated torques [N·m] by joint from texts JOINT:TORQUE; raises BadInput."""
-    found = {}
-    for text in texts:
-        joint, _, number = text.rpartition(":")
-        try:
-            torque = float(number)
-        except ValueError:
-            torque = math.nan
-        if not joint or not 0 < torque < math.inf:
-            raise BadInput(f"--rated-torque {text}: expected JOINT:TORQUE in N·m, such as elbow:27")
-        found[joint] = torque
-    return found
+    expected = "JOINT:TORQUE in N·m, such as elbow:27"
+    found = _numbers("--rated-torque", texts, 1, lambda torque: 0 < torque < math.inf, expected)
+    return {joint: torque for joint, (torque,) in found.items()}
 
 
 def parse_locks(texts: Sequence[str]) -> dict[str, float]:
     """Positions [rad, m] by joint from texts JOINT or JOINT:POSITION; raises BadInput."""
-    found = {}
-    for text in texts:
-        joint, _, number = text.rpartition(":") if ":" in text else (text, "", "0")
-        try:
-            position = float(number)
-        except ValueError:
-            position = math.nan
-        if not joint or not math.isfinite(position):
-            raise BadInput(f"--lock {text}: expected JOINT:POSITION in rad or m, such as lift:0.2")
-        found[joint] = position
-    return found
+    given = [text if ":" in text else f"{text}:0" for text in texts]
+    found = _numbers("--lock", given, 1, math.isfinite, "JOINT:POSITION in rad or m, such as lift:0.2")
+    return {joint: position for joint, (position,) in found.items()}
 
 
 def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":

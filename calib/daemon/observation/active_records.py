@@ -6,7 +6,8 @@ from collections.abc import Callable
 from armlink.errors import ArmlinkError
 from armlink.link.types import Calibration
 from calib.daemon.environment import RETRY_SECONDS, BusJobs, Environment
-from calib.daemon.observation.observation import ActiveObservation
+from calib.daemon.observation.observation import ObserverFeed
+from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.events import EventLog
@@ -27,7 +28,7 @@ Held = tuple[Calibration, ...] | None
 
 
 class ActiveRecords:
-    """Holds the observation against the records in force, and keeps it in step with store and controllers."""
+    """Holds the observer of the records in force, and keeps it in step with store and controllers."""
 
     def __init__(
         self,
@@ -37,13 +38,15 @@ class ActiveRecords:
         arm_state: ArmState,
         events: EventLog,
         jobs: BusJobs,
-        observe: Callable[[CalibrationRecord, GravityRecord], ActiveObservation],
+        recalibrations: RecalibrationWorkflow,
+        observe: Callable[[CalibrationRecord, GravityRecord], ObserverFeed],
     ) -> None:
-        """`observe` makes the observation against a pair of records; raises Refused if they are of another arm."""
+        """`observe` begins to observe against a pair of records; raises Refused if they are of another arm."""
         self._configuration, self._environment, self._store = configuration, environment, store
         self._arm_state, self._events, self._jobs, self._observe = arm_state, events, jobs, observe
-        self.observation: ActiveObservation | None = None
-        """None until there are both records."""
+        self._recalibrations = recalibrations
+        self.feed: ObserverFeed | None = None
+        """The observer against the records in force; None until there are both."""
         self.detail = ""
         """Why there is no observation, or none against the newest records; empty otherwise."""
         self._held: Held = None
@@ -94,7 +97,7 @@ class ActiveRecords:
         if isinstance(found, StoreFault):
             self._looked = self._environment.monotonic() - RECORDS_SECONDS + RETRY_SECONDS
             if not self._store_fault:
-                kept = "" if self.observation is None else "; the current records stay in use"
+                kept = "" if self.feed is None else "; the current records stay in use"
                 self._events.say("fault", None, f"{found}{kept}", {})
             self._store_fault = str(found)
             return
@@ -123,11 +126,11 @@ class ActiveRecords:
                 _LOG.warning(waits)
             self.detail = waits
             return
-        before = self.observation
-        if before is not None and before.feed.measures_against(calibration, gravity, arm):
+        before = self.feed
+        if before is not None and before.measures_against(calibration, gravity, arm):
             self.detail = ""
             return
-        self.observation = self._observe(calibration, gravity)
+        self.feed = self._observe(calibration, gravity)
         self.detail = ""
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
@@ -138,10 +141,9 @@ class ActiveRecords:
 
     def renew(self) -> None:
         """Other thresholds: a new observer against the same records, which continues from the saved state."""
-        if self._jobs.busy or self.observation is None:
+        if self._jobs.busy or self.feed is None:
             return
-        feed = self.observation.feed
-        self.observation = self._observe(feed.calibration, feed.gravity)
+        self.feed = self._observe(self.feed.calibration, self.feed.gravity)
         if self._arm_state.connected and not self._configuration.listen_only:
             self._ask()
 
@@ -153,7 +155,7 @@ class ActiveRecords:
         self._unchecked = self._jobs.busy
         if self._unchecked:
             return
-        if self.observation is None:
+        if self.feed is None:
             return
         arm, store = self._configuration.arm, self._store
         self._jobs.aside(lambda: store.unfinished_write(arm), self._compare_or_ask)
@@ -194,11 +196,10 @@ class ActiveRecords:
 
     def _compare(self) -> None:
         """Compare the controllers with the record in force; under the policy apply, write it if they differ."""
-        if self.observation is None:
+        feed = self.feed
+        if feed is None:
             return
-        feed = self.observation.feed
         differ, record = feed.controllers_hold(self._held), feed.calibration
-        recalibrations = self.observation.recalibrations
         if not differ:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:
@@ -216,9 +217,8 @@ class ActiveRecords:
                 return
             feed.controllers_hold(None)
             self._arm_state.calibrated(outcome)
-            recalibrations.restored(outcome)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
             text = f"record {record.id} was written again to {', '.join(outcome)}"
             self._events.say("recalibration", None, text, evidence)
 
-        self._jobs.start(recalibrations.restore, done)
+        self._jobs.start(self._recalibrations.restore, done)

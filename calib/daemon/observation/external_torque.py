@@ -9,8 +9,8 @@ from calib.arm.kinematics import StatedModel, gcomp_arm
 from calib.daemon.environment import Environment
 from calib.daemon.observation.observation import ObserverFeed
 from calib.daemon.settings import Configuration
-from calib.daemon.state.events import EventLog, Hub
-from calib.daemon.view import ContactItem, ExternalEvent
+from calib.daemon.state.events import EventLog
+from calib.daemon.view import ContactItem, ExternalEvent, Hub
 from calib.external.arm_model import ArmRecords
 from calib.external.listening import Learned, LiveExternal, load_learned
 from calib.external.tables import event_of, event_text

@@ -1,6 +1,5 @@
-"""The observer of a pair of records, between bus loop, journal and recalibration: fed, kept on disk, acted upon."""
+"""The observer of a pair of records, between bus loop and journal: fed, and kept on disk."""
 
-from collections.abc import Callable
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -9,9 +8,8 @@ from armlink.arm_file import ArmFile
 from armlink.loop.messages import Batch
 from armlink.torque_calibration import UNCALIBRATED, Calibration, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.environment import BusJobs, Environment
-from calib.daemon.observation.recalibration_workflow import DAY, RecalibrationWorkflow, Samples
-from calib.daemon.state.events import EventLog, describe, one_alarm_a_joint
+from calib.daemon.environment import Environment
+from calib.daemon.observation.recalibration_workflow import DAY, Samples
 from calib.daemon.state.journal import Journal
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding, Event
@@ -47,6 +45,8 @@ class ObserverFeed:
         self._group = max(1, round(section.rate / OBSERVED_RATE))
         self._change = per_joint([UNCALIBRATED] * described.n)
         self._left: Samples | None = None
+        self.last_accepted: dict[str, datetime] = {}
+        """Time of the newest row that went into each joint's estimate."""
 
     def measures_against(self, calibration: CalibrationRecord, gravity: GravityRecord, arm: ArmFile) -> bool:
         return (calibration.id, gravity.carrying(arm).id) == (self.calibration.id, self.carried.id)
@@ -92,11 +92,12 @@ class ObserverFeed:
             _mean(torque.reshape(-1, self._group, n)),
         )
 
-    def observe(self, samples: Samples, temperature: Array | None = None) -> list[Event]:
+    def observe(self, samples: Samples, temperature: Array | None, now: datetime) -> list[Event]:
         """Give decimated samples, and the drives' temperatures (n,) [°C] meanwhile, to the observer: its events."""
-        events: list[Event] = []
+        events, before = list[Event](), self.observer.accepted
         for t, position, torque in zip(*samples, strict=True):
             events += self.observer.handle(float(t), position, torque, temperature)
+        self.last_accepted |= {self.names[j]: now for j in np.flatnonzero(self.observer.accepted > before)}
         return events
 
     def point(self) -> dict[str, list[float]]:
@@ -154,55 +155,3 @@ class ObserverStorage:
             feed.observer.restore(saved.state)
         elif saved.calibration == feed.calibration.parent and installed and feed.observer.restore(saved.state):
             feed.observer.install(installed)
-
-
-class ActiveObservation:
-    """`handle` a batch of samples: to the observer, and what it finds to the event log and to recalibration."""
-
-    def __init__(
-        self,
-        feed: ObserverFeed,
-        recalibrations: RecalibrationWorkflow,
-        storage: ObserverStorage,
-        journal: Journal,
-        events: EventLog,
-        jobs: BusJobs,
-        more_poses: Callable[[str], None],
-    ) -> None:
-        """`more_poses` asks for a tour of poses, with the reason, if the observer cannot decide."""
-        self.feed, self.recalibrations = feed, recalibrations
-        self._storage, self._journal, self._events = storage, journal, events
-        self._jobs, self._more_poses = jobs, more_poses
-        self.last_accepted: dict[str, datetime] = {}
-        """Time of the newest row that went into each joint's estimate."""
-        self._accepted = feed.observer.accepted
-
-    def handle(self, batch: Batch) -> None:
-        samples = self.feed.decimate(batch)
-        if self._jobs.busy:
-            return  # the calibration changes under these readings
-        events = self.feed.observe(samples, batch.temperature)
-        accepted = self.feed.observer.accepted
-        for name, more in zip(self.feed.names, accepted > self._accepted, strict=True):
-            if more:
-                self.last_accepted[name] = self._events.now()
-        self._accepted = accepted
-        if events:
-            self._report(events)
-        self.recalibrations.watch(samples, self.feed.observer.held)
-
-    def _report(self, events: list[Event]) -> None:
-        """Keep events and estimates together, then act on the findings."""
-        described = [(event, *describe(event)) for event in one_alarm_a_joint(events)]
-        with self._journal.transaction():
-            for event, kind, text, evidence in described:
-                self._events.say(kind, event.joint, text, evidence)
-            self._storage.save(self.feed, history=True)
-        for event, kind, _, _ in described:
-            if event.kind == "verdict":
-                self.recalibrations.explained(kind, event.joint)
-        for event in events:
-            if event.finding is not None:
-                self.recalibrations.found(event.finding)
-            elif event.kind == "undecided":
-                self._more_poses("the readings so far cannot decide on the cause")

@@ -55,7 +55,6 @@ class RecalibrationWorkflow:
         """Joint and time of every write, by the monotonic clock [s]."""
         self._approved: deque[tuple[ProposalRow, str]] = deque()
         """Proposals whose approval is on disk, by whom: written as soon as no other job is under way."""
-        self._checking: tuple[str, ...] = ()
         self._worse: Checked | None = None
         """A write that made the readings worse and could not be taken back yet."""
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
@@ -67,7 +66,7 @@ class RecalibrationWorkflow:
         that led to the record now in force, if one did.
         """
         self._recalibrator, self._installed = recalibrator, installed
-        self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
+        self._waiting, self._unexplained = [], deque(maxlen=WAITING)
         self._worse = None
         current, last = recalibrator.record, None
         for row in self._journal.proposals():
@@ -268,7 +267,6 @@ class RecalibrationWorkflow:
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
         joint, values, number = row.proposal.joint, record.joints[row.finding.joint], row.proposal.id
-        self._checking = (joint,)
         gain = "as before" if values.gain is None else f"{values.gain:.5f}"
         text = f"{joint}: record {record.id} is current: gain {gain}, offset {values.offset or 0.0:.3f} N·m"
         evidence = {"proposal": number, "record": record.id, "replaces": row.proposal.base, "by": by, "applied": True}
@@ -279,16 +277,12 @@ class RecalibrationWorkflow:
         """Write the current record to controllers that hold another calibration; returns the joints written."""
         return self._active().restore()
 
-    def restored(self, joints: tuple[str, ...]) -> None:
-        """The current record was written to the controllers of these joints: `watch` checks it."""
-        self._checking = joints
-
     def watch(self, samples: Samples, held: bool) -> None:
         """Give decimated samples to the check after a write; a write that made the readings worse is taken back.
 
         While an alarm is open (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
         """
-        if not self._checking or self._jobs.busy:
+        if self._jobs.busy or not self._active().checking:
             return
         if held:
             self._unexplained.append(samples)
@@ -299,7 +293,7 @@ class RecalibrationWorkflow:
     def explained(self, kind: str, joint: str | None) -> None:
         """An alarm's cause is known: samples that waited count if it is a drift of the joint just recalibrated."""
         waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
-        if kind != "drift" or joint not in self._checking:
+        if kind != "drift" or joint not in [self._names[j] for j in self._active().checking]:
             return
         for samples in waiting:
             self._check(samples)
@@ -308,7 +302,6 @@ class RecalibrationWorkflow:
         for t, position, torque in zip(*samples, strict=True):
             checked = self._active().sample(float(t), position, torque)
             if checked is not None:
-                self._checking = ()
                 self._checked(checked)
                 return
 

@@ -2,7 +2,7 @@
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.loop.messages import BATCH_SECONDS, Batch
 from armlink.recording.mcap import RecordingWriter
-from calib.daemon.environment import RunAside
+from calib.daemon.environment import Worker
 from calib.daemon.settings import Configuration, RecordingSettings
 from calib.daemon.state.events import EventLog
 
@@ -164,17 +164,13 @@ class Minute:
     """Path of all joints together [rad]."""
     parts: tuple[Rows, ...]
 
-    def write(self, path: Path, names: tuple[str, ...]) -> Iterator[None]:
-        """Write an MCAP recording in parts, so that other work can go on between them; raises OSError."""
-        begun, written = self.parts[0][0][0], 0
+    def write(self, path: Path, names: tuple[str, ...]) -> None:
+        """Write an MCAP recording; raises OSError."""
+        begun = self.parts[0][0][0]
         with RecordingWriter(path, names) as writer:
             for t, channels in self.parts:
                 for k, at in enumerate((t - begun).tolist()):
                     writer.append(at, {name: values[k] for name, values in channels.items()})
-                written += len(t)
-                if written >= 300:  # some hundredths of a second
-                    written = 0
-                    yield
 
 
 class BusiestMinute:
@@ -227,7 +223,7 @@ class Recordings:
     the thread that `run` gives work to.
     """
 
-    def __init__(self, directory: Path, configuration: Configuration, run: RunAside) -> None:
+    def __init__(self, directory: Path, configuration: Configuration, run: Worker) -> None:
         """Files go to `directory`, which is made with the first one."""
         self._directory, self._configuration, self._run = directory, configuration, run
         self._waiting, self._full = 0, False

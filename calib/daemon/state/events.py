@@ -1,6 +1,5 @@
 """Events: of the observer in words, to the journal, to the clients of the stream, and to the process's log."""
 
-import asyncio
 import logging
 import math
 from collections.abc import Callable
@@ -9,43 +8,9 @@ from datetime import datetime
 from typing import Any
 
 from calib.daemon.state.journal import Journal
-from calib.daemon.view import ContactItem, EventItem, EventRecord, JointsItem
+from calib.daemon.view import EventItem, EventRecord, Hub
 from calib.observer.decision import Event
 from calib.observer.evidence import DRIFT
-
-Item = JointsItem | ContactItem | EventItem
-
-
-class Client(asyncio.Queue[Item]):
-    """One client's items: those of five seconds of joints; used on the event loop's thread only."""
-
-    def __init__(self, hub: "Hub") -> None:
-        super().__init__(maxsize=50)
-        self._hub = hub
-
-    def add(self, item: Item) -> None:
-        """Add an item; if the queue is full the oldest one is lost."""
-        if self.full():
-            self.get_nowait()
-        self.put_nowait(item)
-
-    def close(self) -> None:
-        self._hub.clients.discard(self)
-
-
-class Hub:
-    def __init__(self) -> None:
-        self.clients: set[Client] = set()
-
-    def subscribe(self) -> Client:
-        client = Client(self)
-        self.clients.add(client)
-        return client
-
-    def publish(self, item: Item) -> None:
-        for client in self.clients:
-            client.add(item)
-
 
 CLOCK_JUMP = 2.0
 """The wall clock was set if between two ticks it moves by this much more or less than the monotonic clock [s]; what

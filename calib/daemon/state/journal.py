@@ -16,23 +16,23 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
-from calib.daemon.environment import RETRY_SECONDS, RunAside
+from calib.daemon.environment import RETRY_SECONDS, Worker
 from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of, utc_text
 from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
+from calib.records.database import ANSWER_SECONDS, append_only
 
 R = TypeVar("R")
 
 SCHEMA = 1
 LOCK_SECONDS = 0.05
 """Wait for another program's lock [s]; what cannot be kept now is kept later."""
-OPEN_SECONDS = 10.0
-"""Likewise at the start [s]."""
 SILENT_SECONDS = 2.0
 """A disk that takes longer for a write is said to be in trouble [s]: four times what the SD specification (4.6.2.2)
 allows a card for one."""
@@ -93,7 +93,7 @@ class Transaction:
 class Journal:
     """One process writes it; any other may read it. `_db` is for the thread that `run` gives work to."""
 
-    def __init__(self, path: Path, monotonic: Callable[[], float], run: RunAside) -> None:
+    def __init__(self, path: Path, monotonic: Callable[[], float], run: Worker) -> None:
         """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s].
 
         One that is damaged is set aside, under another name, and a new one is begun.
@@ -124,9 +124,10 @@ class Journal:
         try:
             self._open()
         except (sqlite3.DatabaseError, OSError, UnicodeDecodeError) as error:
-            if not _is_damage(error):
+            self._damaged = _is_damage(error)
+            if not self._damaged:
                 raise self._not_opened(error) from None
-            self._begin_anew()
+            self._reopen()
 
     @property
     def trouble(self) -> str:
@@ -147,7 +148,6 @@ class Journal:
 
     @property
     def waiting(self) -> int:
-        """Number of transactions that are not on disk yet."""
         return len(self._queue)
 
     @property
@@ -158,39 +158,34 @@ class Journal:
     def _not_opened(self, error: Exception) -> BadInput:
         return BadInput(f"{self.path}: the journal cannot be opened: {error}")
 
-    def _begin_anew(self) -> None:
-        """Set the damaged file aside and begin another; raises BadInput if that is not possible."""
+    def _reopen(self) -> None:
+        """Go over to the file that has the journal's name now or, if that is damaged, set it aside and begin another.
+
+        Raises BadInput if that is not possible.
+        """
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}")
         try:
+            if not self._damaged:
+                # its write-ahead log, which SQLite leaves where the file was moved, would be taken for the new file's
+                with suppress(sqlite3.ProgrammingError):  # closed by an attempt before
+                    self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             if self._db is not None:
                 self._db.close()
-            for suffix in ("", "-wal", "-shm"):
+            for suffix in ("", "-wal", "-shm") if self._damaged else ():
                 with suppress(FileNotFoundError):
                     self.path.with_name(self.path.name + suffix).rename(aside.with_name(aside.name + suffix))
             self._open()
-        except (sqlite3.Error, OSError) as error:
-            raise self._not_opened(error) from None
-        self.set_aside = aside.name
-        self._damaged = self._replaced = False
-
-    def _open_the_named(self) -> None:
-        """Go over to the file that has the journal's name now; raises BadInput if it cannot be opened."""
-        try:
-            # its write-ahead log, which SQLite leaves where the file was moved, would be taken for the new file's
-            with suppress(sqlite3.ProgrammingError):  # closed by an attempt before
-                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            self._db.close()
-            self._open()
         except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
-            self._damaged = _is_damage(error)
+            self._damaged = self._damaged or _is_damage(error)
             raise self._not_opened(error) from None
-        self._replaced = False
+        self.set_aside = aside.name if self._damaged else self.set_aside
+        self._damaged = self._replaced = False
 
     def _open(self) -> None:
         path = self.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS, check_same_thread=False)
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=ANSWER_SECONDS, check_same_thread=False)
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
             self._db.execute(f"PRAGMA {pragma}")
         found = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
@@ -205,12 +200,8 @@ class Journal:
         with self._committed():
             for statement in filter(str.strip, _TABLES.split(";")):
                 self._db.execute(statement)
-            for table in _APPEND_ONLY:
-                for change in ("UPDATE", "DELETE"):
-                    self._db.execute(
-                        f"CREATE TRIGGER IF NOT EXISTS {table}_no_{change.lower()} BEFORE {change} ON {table} "
-                        f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
-                    )
+            for statement in chain.from_iterable(append_only(table, "sqlite") for table in _APPEND_ONLY):
+                self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
         self._file = file_identity(path)
         self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
@@ -269,10 +260,8 @@ class Journal:
         """Try again what has failed, begin another file where it is damaged, and find out whether trouble is over."""
         if self._asked:
             return
-        if self._damaged:
-            self._ask(self._begin_anew, self._opened_anew)
-        elif self._replaced:
-            self._ask(self._open_the_named, self._opened_anew)
+        if self._damaged or self._replaced:
+            self._ask(self._reopen, self._opened_anew)
         elif self._queue:
             self._write_on()
         elif self.trouble and self._monotonic() - self._failed_at >= RETRY_SECONDS:
@@ -410,7 +399,6 @@ class Journal:
 
     @property
     def last_event(self) -> int:
-        """Id of the newest event on disk; 0 if there is none."""
         return self._last_event
 
     def least_ages(self, kind: str, now: float) -> list[tuple[str | None, dict[str, Any], float]]:

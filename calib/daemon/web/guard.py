@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import h11
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
 from calib.daemon.rate_limit import Rate, RateLimit
@@ -57,8 +56,6 @@ class Access:
 
 
 class Denied(Exception):
-    """A request that is refused here."""
-
     def __init__(self, status: int, why: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(why)
         self.status, self.headers = status, headers or {}
@@ -76,7 +73,6 @@ class RequestGuard:
         self._requests, self._wrong = RateLimit(REQUESTS), RateLimit(WRONG_TOKENS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on to the application, or refuse it."""
         if scope["type"] != "http":
             return
         peer = peer_of(scope)
@@ -94,16 +90,16 @@ class RequestGuard:
 
     async def _pass(self, scope: Scope, peer: Peer, receive: Receive, send: Send) -> None:
         headers, send = Headers(scope=scope), _with_headers(send)
-        incoming = IncomingBody(receive, _has_body(headers))
+        incoming = IncomingBody(receive, headers)
         try:
             self._check(scope, peer, headers)
-            body = await _read_body(Request(scope, incoming))
+            await incoming.read()
         except Denied as denied:
-            if _has_body(headers):
+            if incoming.announced:
                 denied.headers["connection"] = "close"
             await _refuse(denied, incoming, send)
             return
-        await self.app(scope, _replay(body, receive), send)
+        await self.app(scope, incoming, send)
 
     def _check(self, scope: Scope, peer: Peer, headers: Headers) -> None:
         line = len(scope.get("raw_path", b"")) + len(scope["query_string"])
@@ -169,56 +165,42 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _has_body(headers: Headers) -> bool:
-    return headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
-
-
 class IncomingBody:
-    """The `receive` of a request, and whether more of its body may come."""
+    """The `receive` of a request: the body is read whole (`read`), and then what the application receives."""
 
-    def __init__(self, receive: Receive, more: bool) -> None:
-        self._receive, self.more = receive, more
+    def __init__(self, receive: Receive, headers: Headers) -> None:
+        self._receive, self._length = receive, headers.get("content-length", "0")
+        self.announced = self._length != "0" or "transfer-encoding" in headers
+        self.more = self.announced
+        """More of it may come."""
+        self._body: bytes | None = None
+        """Read, and not passed on yet."""
 
     async def __call__(self) -> Message:
+        if self._body is not None:
+            body, self._body = self._body, None
+            return {"type": "http.request", "body": body, "more_body": False}
         message = await self._receive()
         self.more = message["type"] == "http.request" and message.get("more_body", False)
         return message
 
-
-async def _read_body(request: Request) -> bytes:
-    """The whole body; raises Denied if it is too large or too slow."""
-    too_large = Denied(413, f"the body of a request may have at most {BODY_LIMIT} bytes")
-    length = request.headers.get("content-length", "0")
-    if not length.isdigit() or int(length[:20]) > BODY_LIMIT:
-        raise too_large
-    if not _has_body(request.headers):
-        return b""
-    body = b""
-    try:
-        async with asyncio.timeout(PATIENCE_SECONDS):
-            async for piece in request.stream():
-                body += piece
-                if len(body) > BODY_LIMIT:
-                    raise too_large
-            return body
-    except ClientDisconnect:
-        raise Denied(400, "the connection ended before the end of the body") from None
-    except TimeoutError:
-        raise Denied(408, f"the body was not received within {PATIENCE_SECONDS:.0f} s") from None
-
-
-def _replay(body: bytes, receive: Receive) -> Receive:
-    """A `receive` that first returns the body already read."""
-    first = True
-
-    async def replay() -> Message:
-        nonlocal first
-        if first:
-            first = False
-            return {"type": "http.request", "body": body, "more_body": False}
-        return await receive()
-
-    return replay
+    async def read(self) -> None:
+        """Read the whole body; raises Denied if it is too large or too slow."""
+        too_large, body = Denied(413, f"the body of a request may have at most {BODY_LIMIT} bytes"), b""
+        if not self._length.isdigit() or int(self._length[:20]) > BODY_LIMIT:
+            raise too_large
+        try:
+            async with asyncio.timeout(PATIENCE_SECONDS):
+                while self.more:
+                    message = await self()
+                    if message["type"] == "http.disconnect":
+                        raise Denied(400, "the connection ended before the end of the body")
+                    body += message.get("body", b"")
+                    if len(body) > BODY_LIMIT:
+                        raise too_large
+        except TimeoutError:
+            raise Denied(408, f"the body was not received within {PATIENCE_SECONDS:.0f} s") from None
+        self._body = body
 
 
 def _with_headers(send: Send) -> Send:

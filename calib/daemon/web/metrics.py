@@ -40,8 +40,6 @@ ESTIMATE = (
 
 
 class DaemonCollector(Collector):
-    """Reads the view at each scrape; keeps nothing."""
-
     def __init__(self, view: DaemonView, streams: Streams) -> None:
         self._view, self._streams = view, streams
 
@@ -65,7 +63,6 @@ class DaemonCollector(Collector):
 
 
 def metrics_text(view: DaemonView, streams: Streams) -> Callable[[], bytes]:
-    """A function that returns the text of one scrape."""
     registry = CollectorRegistry()
     registry.register(DaemonCollector(view, streams))
     ProcessCollector(registry=registry)

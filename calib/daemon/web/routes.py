@@ -181,12 +181,12 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
-        return await _decided(view.decisions.approve, id, request, decision)
+        return await _decided(view.approve, id, request, decision)
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return await _decided(view.decisions.reject, id, request, decision)
+        return await _decided(view.reject, id, request, decision)
 
 
 async def _decided(

@@ -16,7 +16,7 @@ import resource
 import socket as sockets
 import stat
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -49,25 +49,19 @@ _IMPORT = re.compile(r'^import .* from "\./(.*)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class PageFile:
-    content: bytes
-    media_type: str
-    etag: str
-    policy: str
-    """Header content-security-policy."""
+PAGE = "/"
+"""URL path of the page, which needs no token."""
 
 
-def page_files() -> dict[str, PageFile]:
-    """URL path → file; there is only `/`."""
+def page() -> tuple[bytes, dict[str, str]]:
+    """The page, and the headers that it is sent with."""
     script, style = joined("page.js"), _static("page.css")
     icon = base64.b64encode(_static("icon.svg").encode()).decode()
-    page = _static("index.html").replace("ICON", f"data:image/svg+xml;base64,{icon}")
-    page = page.replace("/* STYLE */", style).replace("/* SCRIPT */", script)
-    content = page.encode()
+    text = _static("index.html").replace("ICON", f"data:image/svg+xml;base64,{icon}")
+    content = text.replace("/* STYLE */", style).replace("/* SCRIPT */", script).encode()
     policy = CSP.format(script=_hash(script), style=_hash(style))
     etag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
-    return {"/": PageFile(content, "text/html; charset=utf-8", etag, policy)}
+    return content, {"etag": etag, "cache-control": "no-cache", "content-security-policy": policy}
 
 
 def joined(name: str) -> str:
@@ -130,7 +124,7 @@ PURPOSE = (
 )
 
 
-def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
+def open_app(view: DaemonView, streams: Streams) -> FastAPI:
     app = Described(
         title="armlink daemon",
         description=PURPOSE,
@@ -140,24 +134,20 @@ def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> 
         redirect_slashes=False,
     )
     app.include_router(api_router(view, streams, metrics_text(view, streams)))
-    for path, file in files.items():
-        app.add_api_route(path, _sender(file), methods=["GET"], include_in_schema=False)
+    content, headers = page()
+
+    @app.get(PAGE, include_in_schema=False)
+    async def send_page(request: Request) -> Response:
+        if request.headers.get("if-none-match") == headers["etag"]:
+            return Response(status_code=304, headers=headers)
+        return Response(content, media_type="text/html; charset=utf-8", headers=headers)
+
     for kind, status in ERRORS.items():
         app.add_exception_handler(kind, _as_json(status))
     app.add_exception_handler(RequestValidationError, _bad_parameter)
     app.add_exception_handler(HTTPException, _of_http)
     app.add_exception_handler(Exception, _unexpected)
     return app
-
-
-def _sender(file: PageFile) -> Callable[[Request], Awaitable[Response]]:
-    async def send(request: Request) -> Response:
-        headers = {"etag": file.etag, "cache-control": "no-cache", "content-security-policy": file.policy}
-        if request.headers.get("if-none-match") == file.etag:
-            return Response(status_code=304, headers=headers)
-        return Response(file.content, media_type=file.media_type, headers=headers)
-
-    return send
 
 
 def _as_json(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
@@ -285,8 +275,8 @@ class _ApiServer(uvicorn.Server):
 
 
 async def _run(view: DaemonView, listening: list[sockets.socket], access: Access) -> None:
-    streams, files = Streams(view), page_files()
-    guarded = RequestGuard(open_app(view, streams, files), replace(access, open_paths=frozenset(files)))
+    streams = Streams(view)
+    guarded = RequestGuard(open_app(view, streams), replace(access, open_paths=frozenset({PAGE})))
     _allow_files()
     config = uvicorn.Config(
         guarded,

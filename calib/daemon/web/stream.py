@@ -116,8 +116,6 @@ class Streams:
 
 
 class StreamResponse(StreamingResponse):
-    """Response of GET /api/stream."""
-
     def __init__(self, streams: Streams, after: int | None) -> None:
         """Begin with the events after id `after`; None: only new ones."""
         super().__init__((), media_type="text/event-stream", headers={"x-accel-buffering": "no"})

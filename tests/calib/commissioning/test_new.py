@@ -260,7 +260,7 @@ def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp
 def test_the_command_finds_other_ids_by_hand_and_its_file_passes_the_check(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0] * 4)
-    monkeypatch.setattr("calib.commands.setup.bus_setup.open_named", lambda bus: LockStepBus(arm=arm))
+    monkeypatch.setattr("calib.commands.setup.new.open_named", lambda bus: LockStepBus(arm=arm))
     monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: hands(arm, made))
     line = ["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]
     assert cli.run(line) == 0
@@ -282,7 +282,7 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     (tmp_path / "real.yaml").write_text(yaml.safe_dump(content))
     described = load_arm("real.yaml")
     arm = SimulatedArm(described, Truth.of(described))
-    monkeypatch.setattr("calib.commands.setup.bus_setup.open_named", lambda bus: LockStepBus(arm=arm))
+    monkeypatch.setattr("calib.commands.setup.new.open_named", lambda bus: LockStepBus(arm=arm))
     person = hands(arm, made)
 
     def turn(text: str) -> None:

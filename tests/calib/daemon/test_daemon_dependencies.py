@@ -339,7 +339,7 @@ def test_a_store_that_is_replaced_by_rename_is_shown_and_followed(tmp_path: Path
     daemon, path = drifted(tmp_path), tmp_path / "records.db"
     (proposal,) = daemon.view.proposals()
     copied(path, tmp_path / "copy").rename(path)
-    refused = daemon.view.decisions.approve(proposal.id, "ann").result(0)
+    refused = daemon.view.approve(proposal.id, "ann").result(0)
     assert (refused.state, "was replaced by another file" in refused.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     (tmp_path / "away").write_bytes(path.read_bytes())
@@ -359,7 +359,7 @@ def test_while_the_store_s_file_is_gone_nothing_is_written(tmp_path: Path) -> No
     path.rename(tmp_path / "away.db")
     daemon.run(7)
     assert "the file is gone" in (daemon.view.status().store_fault or "")
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
+    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert (answer.state, "the file is gone" in answer.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     assert not path.exists()
@@ -393,7 +393,7 @@ def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path:
             raise BusFault("joint gone")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
     daemon.run(7)  # a look at the record store lies within
     daemon.service.journal._db = real
     assert daemon.view.proposals()[0].state == "approved"
@@ -421,7 +421,7 @@ def test_an_outcome_that_waited_for_a_journal_that_was_begun_anew_is_said_and_ho
         daemon.service.journal._db.execute("PRAGMA query_only=ON")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
     daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     daemon.run(5)
     assert daemon.view.status().detail == ""

@@ -114,7 +114,7 @@ def test_a_record_that_makes_readings_worse_is_rolled_back(tmp_path: Path) -> No
     assert daemon.ids == [good.number] * daemon.fast.n
     stages = [(line.record, line.stage) for line in daemon.store.writes(daemon.arm)]
     assert stages == [(each, stage) for each in (record.id, good.id) for stage in ("begun", "finished")]
-    assert daemon.service.records.observation.feed.calibration == good
+    assert daemon.service.records.feed.calibration == good
 
 
 def test_under_propose_an_imported_record_is_not_written(tmp_path: Path) -> None:

@@ -66,18 +66,18 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert proposal.state == "pending"
     assert daemon.view.status().pending_proposals == 1
     assert not any(call.startswith("write") for call in daemon.sdo)
-    approved = daemon.view.decisions.approve(proposal.id, "ann").result(0)
+    approved = daemon.view.approve(proposal.id, "ann").result(0)
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
     with pytest.raises(NotPossible, match="already applied"):
-        daemon.view.decisions.approve(proposal.id, "ann").result(0)
+        daemon.view.approve(proposal.id, "ann").result(0)
 
 
 def test_a_rejected_proposal_changes_nothing(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     before = daemon.store.current(CalibrationRecord, daemon.arm)
-    assert daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann").result(0).state == "rejected"
+    assert daemon.view.reject(daemon.view.proposals()[0].id, "ann").result(0).state == "rejected"
     assert daemon.store.current(CalibrationRecord, daemon.arm) == before
     assert daemon.of_kind("rejected")[0].evidence["by"] == "ann"
 
@@ -92,7 +92,7 @@ def test_under_observe_a_drift_is_an_event_alone(tmp_path: Path) -> None:
 def test_listening_only_sends_nothing_until_something_is_approved(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose", listen_only=True)
     assert daemon.sdo == []
-    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -153,7 +153,7 @@ def test_an_id_of_before_a_damaged_journal_names_no_other_proposal(tmp_path: Pat
     (now,) = daemon.view.proposals()
     for number in (before.id, 1):
         with pytest.raises(NoSuch, match=f"no proposal {number}"):
-            daemon.view.decisions.approve(number, "ann")
+            daemon.view.approve(number, "ann")
     assert daemon.view.proposals() == (now,)
     assert now.id == int(now.record, 16)
 
@@ -161,13 +161,13 @@ def test_an_id_of_before_a_damaged_journal_names_no_other_proposal(tmp_path: Pat
 def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     (proposal,) = daemon.view.proposals()
-    for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
+    for decide in (daemon.view.approve, daemon.view.reject):
         with pytest.raises(NotPossible, match=f"proposal {proposal.id} does not have the hash 000000000000…: look at"):
             decide(proposal.id, "ann", "0" * 64)
     assert not any(call.startswith("write") for call in daemon.sdo)
     daemon.kill()
     daemon.start()
-    assert daemon.view.decisions.approve(proposal.id, "ann", proposal.hash).result(0).state == "applied"
+    assert daemon.view.approve(proposal.id, "ann", proposal.hash).result(0).state == "applied"
 
 
 def test_after_a_damaged_journal_nothing_is_written_automatically_for_a_day(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
     daemon = drifted(tmp_path, "propose")
     (calibration, _) = daemon.good_records()
     other = daemon.store.put(calibration.model_copy(update={"note": "other"}), daemon.arm, by="ann", reason="sweep")
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
+    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
     assert f"is superseded: it is not current in {daemon.store.url} any more ({other} is)" in answer.note
     assert not any(call.startswith("write") for call in daemon.sdo)
@@ -197,7 +197,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
 def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     daemon.on_write = daemon.broken
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
+    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
     assert "joint gone" in answer.note
     assert daemon.store.current(CalibrationRecord, daemon.arm).id == answer.base
@@ -264,7 +264,7 @@ def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     assert daemon.view.status().rows == rows
     for before, after in zip(estimates, daemon.view.estimates(), strict=True):
         assert after.model_copy(update={"last_accepted": before.last_accepted}) == before
-    daemon.view.decisions.approve(proposals[0].id, "ann")
+    daemon.view.approve(proposals[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -318,7 +318,7 @@ def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Pat
     daemon = drifted(tmp_path, "propose")
     jobs: list[tuple[Any, Any]] = []
     daemon.run_aside = lambda work, done: jobs.append((work, done))
-    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
     daemon.fast.held_gain[5] = 1.3
     daemon.service.take(Down("no power"))
     daemon.service.take(Up(daemon.held()))
@@ -420,7 +420,7 @@ def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -
     daemon.service.reload(daemon.arm, settings("apply", observer={"window": 16}))
     status = daemon.view.status()
     assert (status.policy, status.rows) == ("apply", rows)
-    assert daemon.service.records.observation.feed.observer.config.window == 16
+    assert daemon.service.records.feed.observer.config.window == 16
 
 
 def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
@@ -489,7 +489,7 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
     import sqlite3
 
     daemon = drifted(tmp_path, "propose")
-    daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann")
+    daemon.view.reject(daemon.view.proposals()[0].id, "ann")
     for statement in ("UPDATE events SET text = ''", "DELETE FROM proposals", "DELETE FROM decisions"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
             daemon.service.journal._db.execute(statement)

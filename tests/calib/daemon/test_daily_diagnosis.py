@@ -20,7 +20,7 @@ from calib.daemon.environment import Environment
 from calib.daemon.observation import daily_diagnosis
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
-from calib.daemon.state.arm_state import BusiestMinute
+from calib.daemon.state.arm_state import BusiestMinute, Minute
 
 PATIENCE = 3600.0
 """A process of low priority is given this time on a busy machine [s]."""
@@ -57,10 +57,14 @@ class Bench:
             self.now = t[-1] + 0.004
 
     def due(self) -> None:
-        """A day later, until the process has begun."""
+        """A day later, until the process has begun, or nothing is under way."""
         self.time += timedelta(hours=24)
-        for _ in range(100):
+        before, end = self.daily._process, time.monotonic() + PATIENCE
+        while time.monotonic() < end:
             self.daily.tick()
+            if self.daily._under_way is None or self.daily._process is not before:
+                return
+            time.sleep(0.01)
 
     def say(self, *event: Any) -> None:
         self.said.append(event)
@@ -71,10 +75,9 @@ class Bench:
         self.time += timedelta(hours=24)
         while len(self.said) == before and time.monotonic() < end:
             self.daily.tick()
-            if self.daily._process is not None:
-                time.sleep(0.02)
-            elif self.daily._writing is None:
+            if self.daily._under_way is None:
                 return
+            time.sleep(0.02)
 
 
 def in_place_of_a_diagnosis(program: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,16 +108,17 @@ def test_the_minute_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> 
     assert len(found.t) == 15_025
     assert found.t[0] == 0.0
     np.testing.assert_allclose(np.diff(found.t), 0.004, atol=1e-8)
+    time_before = bench.daily._last
     bench.due()
-    assert bench.daily._process is None, "each minute is diagnosed once"
+    assert bench.daily._last == time_before, "each minute is diagnosed once"
 
 
 def test_a_wall_clock_that_is_set_brings_no_diagnosis_and_puts_none_off(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
     bench.work(25.0)
     bench.set_by = timedelta(days=3)
-    for _ in range(100):
-        bench.daily.tick()
+    bench.daily.tick()
+    assert bench.daily._under_way is None
     assert not (tmp_path / "diagnosis").exists()
     bench.set_by = timedelta(days=-3)
     bench.due()
@@ -182,13 +186,25 @@ def test_a_directory_that_cannot_be_written_is_no_end_of_the_daemon(tmp_path: Pa
     assert "no model file" in bench.said[1][2]
 
 
-def test_a_recording_half_written_is_none(tmp_path: Path) -> None:
+def test_a_recording_half_written_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(self: Minute, path: Path, names: tuple[str, ...]) -> None:
+        path.write_bytes(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Minute, "write", half)
     bench = Bench(tmp_path / "diagnosis")
     bench.work(30.0)
-    bench.time += timedelta(hours=24)
-    bench.daily.tick()
-    bench.daily.close()
+    bench.day()
+    assert "no space left" in bench.said[0][2]
     assert not list((tmp_path / "diagnosis").glob("*.mcap"))
+
+
+def test_after_the_end_none_begins(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "diagnosis")
+    bench.work(30.0)
+    bench.daily.close()
+    bench.due()
+    assert bench.daily._process is None
 
 
 def test_closing_ends_the_process(tmp_path: Path) -> None:
@@ -201,14 +217,16 @@ def test_closing_ends_the_process(tmp_path: Path) -> None:
     assert process.poll() is not None
 
 
-def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
+def test_one_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_place_of_a_diagnosis(tmp_path / "program", "exec sleep 3600", monkeypatch)
+    monkeypatch.setattr(daily_diagnosis, "LONGEST", 0.6)
     bench = Bench(tmp_path / "diagnosis")
     bench.work(30.0)
-    bench.due()
-    assert bench.daily._process is not None
-    bench.daily._begun -= 3600.0
-    bench.daily.tick()
-    assert "took longer than 30 min" in bench.said[0][2]
+    bench.day()
+    assert "took longer than 0 min" in bench.said[0][2]
+    process = bench.daily._process
+    assert process is not None
+    assert process.poll() is not None
 
 
 def test_the_causes_are_said_each_day_and_wear_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

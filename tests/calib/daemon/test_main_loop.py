@@ -56,7 +56,7 @@ class Running:
         self.write(lambda content: None)
         self.started: list[NoProcess] = []
         patch.setattr(Options, "keep", lambda options, arm: self._start(arm))
-        patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
+        patch.setattr(main_loop, "Worker", lambda *_: Immediate())
         options = Options(arm=str(self.arm_file), socket=folder / "api.sock", store=str(folder / "records.db"))
         self.process = NoProcess()
         self.daemon = Daemon(options, load_arm(self.arm_file), self.process, folder / "state")  # type: ignore[arg-type]

@@ -122,12 +122,12 @@ def test_an_approval_waits_for_the_disk_and_no_controller_is_written_before(tmp_
     daemon = drifted(tmp_path)
     daemon.disk.held = True
     daemon.sdo.clear()
-    answer = daemon.view.decisions.approve(waiting(daemon), "ann")
+    answer = daemon.view.approve(waiting(daemon), "ann")
     daemon.run(10)
     assert not answer.done()
     assert [each for each in daemon.sdo if each.startswith("write")] == []
     assert daemon.view.proposals()[0].state == "pending"
-    for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
+    for decide in (daemon.view.approve, daemon.view.reject):
         with pytest.raises(NotPossible, match="already decided; the decision waits for the disk"):
             decide(waiting(daemon), "bob")
     daemon.disk.release()
@@ -140,19 +140,19 @@ def test_an_approval_that_is_not_on_disk_at_a_kill_was_never_given(tmp_path: Pat
     daemon = drifted(tmp_path)
     daemon.disk.held = True
     daemon.sdo.clear()
-    daemon.view.decisions.approve(waiting(daemon), "ann")
+    daemon.view.approve(waiting(daemon), "ann")
     daemon.kill()
     daemon.disk.held, daemon.disk.waiting = False, []
     daemon.start()
     assert daemon.view.proposals()[0].state == "pending"
     assert [each for each in daemon.sdo if each.startswith("write")] == []
-    assert daemon.view.decisions.approve(waiting(daemon), "ann").result(0).state in ("approved", "applied")
+    assert daemon.view.approve(waiting(daemon), "ann").result(0).state in ("approved", "applied")
 
 
 def test_an_approval_is_not_written_once_another_record_is_in_force(tmp_path: Path) -> None:
     daemon = drifted(tmp_path)
     daemon.disk.held = True
-    answer = daemon.view.decisions.approve(waiting(daemon), "ann")
+    answer = daemon.view.approve(waiting(daemon), "ann")
     provenance_of = provenance(daemon.arm, created=START + timedelta(hours=1))
     other = CalibrationRecord(**provenance_of, joints=daemon.good_records()[0].joints)
     daemon.store.put(other, daemon.arm, by="ann", reason="sweep")
@@ -184,7 +184,7 @@ def test_what_waits_is_bounded_and_decisions_are_never_dropped(tmp_path: Path, m
     daemon = drifted(tmp_path)
     daemon.disk.held = True
     daemon.service.events.say("clock", None, "is being written", {})
-    daemon.view.decisions.reject(waiting(daemon), "ann")
+    daemon.view.reject(waiting(daemon), "ann")
     for number in range(200):
         daemon.service.events.say("clock", None, f"number {number}", {})
         daemon.service.save()

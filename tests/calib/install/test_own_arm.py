@@ -182,6 +182,6 @@ def test_without_a_serial_number_a_daemon_observes_and_proposes(tmp_path: Path) 
     one.run(200, until=lambda: bool(one.view.proposals()))
     (proposal,) = one.view.proposals()
     assert (proposal.state, proposal.joint) == ("pending", "joint_3")
-    answer = one.view.decisions.approve(proposal.id, "ann").result(0)
+    answer = one.view.approve(proposal.id, "ann").result(0)
     assert answer.state == "failed"
     assert "give this arm a serial in sarcos.yaml (`serial: …`)" in answer.note

@@ -197,7 +197,7 @@ def test_the_same_samples_give_the_same_events(sarcos, sarcos_beta) -> None:
 
 def test_position_gain_and_offset_are_applied(sarcos, sarcos_beta) -> None:
     gain, offset = np.full(7, 1.01), np.full(7, 0.02)
-    observer = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA, None, gain, offset)
+    observer = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA, None, lambda reading: gain * reading + offset)
     random = np.random.default_rng(0)
     for k in range(60):
         q = random.uniform(sarcos.lower, sarcos.upper)

@@ -173,7 +173,7 @@ def test_a_server_that_is_not_there_is_one_line_without_the_password() -> None:
 
 def test_a_server_that_hangs_is_a_failure_after_a_while_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its processes stand still (SIGSTOP); the kernel goes on to acknowledge what is sent, so that TCP sees nothing."""
-    monkeypatch.setattr("calib.records.hanging_server.SILENT_SECONDS", 0.3)
+    monkeypatch.setattr("calib.records.database.ANSWER_SECONDS", 0.3)
     monkeypatch.setitem(database._POSTGRESQL, "connect_timeout", 2)
     try:
         with stoppable_server() as running:

@@ -9,8 +9,7 @@ import numpy as np
 from armlink.arm_file import load_arm
 from calib.daemon import view
 from calib.daemon.service_view import drawn_arm
-from calib.daemon.state.events import Client, Hub
-from calib.daemon.view import NoSuch, NotPossible, Window
+from calib.daemon.view import Client, Hub, NoSuch, NotPossible, Window
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
@@ -21,7 +20,6 @@ class MadeUpView:
 
     def __init__(self) -> None:
         self.hub = Hub()
-        self.decisions = self
         self.begin()
 
     def begin(self) -> None:

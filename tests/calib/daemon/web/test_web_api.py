@@ -19,7 +19,7 @@ from calib.daemon.view import HistoryPoint
 from calib.daemon.web import history, routes
 from calib.daemon.web import server as page_module
 from calib.daemon.web.history import LARGEST_ID, Id
-from calib.daemon.web.server import page_files
+from calib.daemon.web.server import PAGE
 from calib.daemon.web.stream import Streams
 
 
@@ -202,7 +202,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
     """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
-    from calib.daemon.view import DaemonView, Decisions
+    from calib.daemon.view import DaemonView
     from calib.daemon.web.server import open_app
 
     described = server.client().get("/openapi.json").json()["paths"]
@@ -210,13 +210,12 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     assert writing == {("/api/proposals/{id}/approve", "post"), ("/api/proposals/{id}/reject", "post")}
     bodies = json.dumps([described[path][method].get("requestBody") for path, method in writing])
     assert "Decision" in bodies
-    app = open_app(view, Streams(view), page_files())
-    known = {*described, "/openapi.json", *page_files()}
+    app = open_app(view, Streams(view))
+    known = {*described, "/openapi.json", PAGE}
     assert all(path in known for path in route_paths(app.routes))
-    offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
+    offered = {name for name in vars(DaemonView) if not name.startswith("_")}
     reading = {"status", "joints", "estimates", "external", "events", "history_pages", "proposals", "subscribe"}
-    assert offered == reading | {"decisions", "arm", "window"}
-    assert decided == {"approve", "reject"}
+    assert offered == reading | {"arm", "window"} | {"approve", "reject"}
 
 
 def route_paths(routes: Any) -> set[str]:
@@ -278,8 +277,7 @@ def test_the_page_comes_from_here_alone(server: Served) -> None:
     assert "default-src 'none'" in policy
     assert "http" not in policy
     files: Callable[[str], Any] = client.get
-    for path in page_files():
-        answer = files(path)
-        assert answer.status_code == 200
-        assert "://" not in answer.text.replace("http://www.w3.org/", "")
-        assert client.get(path, headers={"if-none-match": answer.headers["etag"]}).status_code == 304
+    answer = files(PAGE)
+    assert answer.status_code == 200
+    assert "://" not in answer.text.replace("http://www.w3.org/", "")
+    assert client.get(PAGE, headers={"if-none-match": answer.headers["etag"]}).status_code == 304

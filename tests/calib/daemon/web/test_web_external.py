@@ -19,9 +19,8 @@ PUSH = 6.0
 
 
 def records_of(daemon: FastDaemon) -> ArmRecords:
-    observation = daemon.service.records.observation
-    assert observation is not None
-    feed = observation.feed
+    feed = daemon.service.records.feed
+    assert feed is not None
     return ArmRecords(StatedModel(gcomp_arm(daemon.arm), None, None, None, daemon.arm), feed.calibration, feed.gravity)
 
 

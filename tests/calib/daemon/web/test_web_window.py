@@ -91,7 +91,7 @@ def test_a_daemon_keeps_what_its_joints_read(tmp_path: Path) -> None:
     assert abs((window.time - bench.view.status().time).total_seconds()) < 0.2
     for channel in ("position", "torque", "model_torque"):
         np.testing.assert_allclose(window.channels[channel][-1], [getattr(each, channel) for each in now])
-    single = bench.service.records.observation.feed.observer.model_torque(window.channels["position"][3])
+    single = bench.service.records.feed.observer.model_torque(window.channels["position"][3])
     np.testing.assert_allclose(window.channels["model_torque"][3], single, rtol=1e-12)
     drawn = bench.view.arm()
     assert [each.joint for each in drawn.joints] == [each.joint for each in now]
