@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.model_file import Beside, compile_model, read_model
 from calib.arm.sweep_section import ParkedArm, sweep_section
-from calib.plan.types import SCOUT_TITLE, Sweep, SweepPlan
+from calib.plan.types import APPROACH, SCOUT_TITLE, Sweep, SweepPlan
 from gcomp.arrays import Array, Mask
 
 DEPTH = 0.0005
@@ -272,8 +272,8 @@ def ways_along(plan: SweepPlan, here: Array | None = None) -> Iterator[tuple[str
 
 
 def sweep_ends(sweep: Sweep) -> tuple[Array, Array]:
-    """First and last pose (n,) [rad] of a sweep."""
+    """First and last pose (n,) [rad] on the way of a sweep: each step is approached from before it."""
     begin = np.array(sweep.rest)
     end = begin.copy()
-    begin[sweep.joint], end[sweep.joint] = sweep.steps[0], sweep.steps[-1]
+    begin[sweep.joint], end[sweep.joint] = sweep.steps[0] - APPROACH, sweep.steps[-1] + APPROACH
     return begin, end

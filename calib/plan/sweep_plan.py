@@ -16,7 +16,7 @@ from calib.plan.collisions import Collided, sweep_ends
 from calib.plan.planned_arm import SLOWEST, PlannedArm, nearest_first
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments, stop_combinations, with_lever
-from calib.plan.types import Sweep, SweepPlan
+from calib.plan.types import APPROACH, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
@@ -116,6 +116,7 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
 def _without_collision(candidates: Candidates, planned: PlannedArm) -> Candidates:
     """The combinations along which nothing touches; raises Collided if there is none."""
     ends = candidates.poses[:, [0, -1]]
+    ends[:, :, candidates.joint] += -APPROACH, APPROACH
     free = np.array([planned.is_clear(*each) for each in ends])
     if free.any() or planned.geometry is None:
         return candidates.kept(free)

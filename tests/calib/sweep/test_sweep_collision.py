@@ -13,6 +13,7 @@ from armlink.cli import run
 from calib.plan.collisions import DEPTH, Collided, Geometry, check_plan, clear_way, ways_along
 from calib.plan.planned_arm import PlannedArm
 from calib.plan.sweep_plan import plan_sweep
+from calib.plan.types import APPROACH
 from calib.sweep.verify import verify_poses
 
 
@@ -181,3 +182,24 @@ def test_the_plan_of_a_model_tells_bias_torques_and_what_was_checked(
     assert all(np.abs(sweep["bias"]).max() > 0 for sweep in plan["sweeps"])
     assert plan["collisions"].startswith("no collision")
     assert "plotly" in picture.read_text(encoding="utf-8")
+
+
+def test_the_approach_to_the_last_step_is_checked(tmp_path: Path) -> None:
+    """A step is approached from before it, so a sweep goes on beyond its last step to come back to it."""
+    plan = plan_sweep(bench(tmp_path))
+    found = 0
+    for sweep in plan.sweeps:
+        steps = np.repeat(np.array(sweep.rest)[None], 30, axis=0)
+        steps[:, sweep.joint] = np.linspace(sweep.steps[0], sweep.steps[-1], 30)
+        beyond = steps[-1:].copy()
+        beyond[:, sweep.joint] += APPROACH
+        for ahead in np.linspace(0.0, 0.3, 61):
+            place = beyond[0].copy()
+            place[sweep.joint] += ahead
+            arm = bench(tmp_path, post(*along(*place, 0.8), half=0.005))
+            if Geometry(arm).free(steps).all() and not Geometry(arm).free(beyond).all():
+                found += 1
+                with pytest.raises(Collided, match="touch"):
+                    check_plan(arm, plan)
+                break
+    assert found
