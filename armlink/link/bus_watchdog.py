@@ -138,7 +138,7 @@ class BusWatch:
     @property
     def babbling(self) -> bool:
         """Whether more frames arrive than a bus with these joints should carry."""
-        return self.flooded or self._beyond >= CROWDED_CYCLES
+        return self.flooded or self._beyond > CROWDED_CYCLES - 1
 
     @property
     def culprit(self) -> str | int:

@@ -35,9 +35,9 @@ class EffectChoice(Generic[Name]):
         """`least` is the fall of the score that an effect has to bring which is added or exchanged; effects `kept` are
         never taken out."""
         self.plain, self.effects, self.least = terms, effects, max(least, AS_GOOD)
-        self.kept = frozenset(kept)
         self.worse = set[frozenset[Name]]()
         self._take([name for name in current if name in effects])
+        self.kept = frozenset(kept).intersection(self.current)
 
     def _take(self, names: list[Name]) -> None:
         self.current = names

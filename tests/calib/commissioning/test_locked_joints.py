@@ -20,7 +20,7 @@ from calib.plan.collisions import Geometry
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.mjcf import build_model
-from sim_gap.model.load import compile_model as simulator_model
+from sim_gap.model.load import read_spec
 
 LIFT = """<robot name="lift">
   <link name="base"/>
@@ -99,7 +99,7 @@ def test_gravity_is_that_of_the_held_pose(model: Path, tmp_path: Path, joint: st
     torque = gravity_torque(known.arm, known.beta, poses)
     np.testing.assert_allclose(torque, expected, atol=1e-6)
 
-    for compiled in (build_model(arm, Imperfections(names)).model, simulator_model(arm.path)):
+    for compiled in (build_model(arm, Imperfections(names)).model, read_spec(arm.path).compile()):
         data = mujoco.MjData(compiled)
         for name, value in zip(names, poses[0], strict=True):
             data.joint(name).qpos[:] = value
