@@ -1,330 +1,166 @@
-"""Which effects: forward and backward by the likelihood of rows that are held out, each parameter at one price.
+"""Choice of effects among hundreds of candidates: forward, backward and by exchange, until no step pays any more.
 
-All is linear about one point, so that a choice takes no further evaluation of the problem.
+A step is tried where a first look promises most, and the scale of the channels follows from what is left after it.
 """
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Generic, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Generic
 
 import numpy as np
 
-from gcomp.arrays import Array
-from gcomp.estimate.problem import EstimationProblem, Index, Linearised
-from gcomp.estimate.solve import precision, robust_weight, scale_of
+from gcomp.estimate.linear_terms import Effect, LinearTerms, Name, price_of
 
-PRICE = 4.0
-"""Fall of the negative logarithm of the held-out likelihood that a parameter has to pay for: the best of m useless ones
-brings log m of rows that are fitted (risk inflation criterion, Foster and George, Annals of Statistics 22, 1994), and
-one less of rows that are held out. A six-joint arm has m = 150: log 150 − 1 = 4.0."""
-SIGNIFICANT = 2.0
-"""Standard errors over the blocks by which an effect has to pay: 98 % of a normal distribution, one-sided."""
-RIDGE = 1e-10
-"""Addition to normal equations of columns of unit length, for columns that are nearly alike."""
-REWEIGHINGS = 3
-"""Fits after which the scale of a channel and the fit that follows from it agree."""
-Name = TypeVar("Name", bound=Hashable)
+SHORTLIST, EXCHANGED, PAIRED = 12, 4, 4
+"""Candidates that are tried in a step, in place of an effect that is there, and together with another one where none
+pays alone: those that promise most beyond their price."""
+MOST_EFFECTS = 60
+"""Largest number of effects of a choice."""
+AS_GOOD = 1e-3
+"""Fall of the cost that is none."""
+ROUNDS = 4
+"""Times that steps and exchanges follow one another."""
 
 
-@dataclass(frozen=True)
-class Effect(Generic[Name]):
-    """Parameters that come together, and what they need beside them."""
+class EffectChoice(Generic[Name]):
+    """The effects `current` of those offered, and steps to better ones."""
 
-    name: Name
-    parameters: tuple[int, ...]
-    needs: tuple[Name, ...] = ()
-    price: float | None = None
-    """Price, if it is not that of all its parameters: some may show nothing, and a rare effect costs more."""
-    excludes: frozenset[Name] = frozenset()
-    """Effects that give way to it: its own other forms, and those whose columns it contains."""
-    simpler: tuple[Name, ...] = ()
-    """Simpler effects that together could take its place."""
+    def __init__(
+        self,
+        terms: LinearTerms,
+        effects: Mapping[Name, Effect[Name]],
+        current: Iterable[Name] = (),
+        least: float = 0.0,
+        kept: Iterable[Name] = (),
+    ) -> None:
+        """`least` is the fall of the score that an effect has to bring which is added or exchanged; effects `kept` are
+        never taken out."""
+        self.plain, self.effects, self.least = terms, effects, max(least, AS_GOOD)
+        self.worse = set[frozenset[Name]]()
+        self._take([name for name in current if name in effects])
+        self.kept = frozenset(kept).intersection(self.current)
 
+    def _take(self, names: list[Name]) -> None:
+        self.current = names
+        self.terms = self.plain.reweighed(self.free(names))
+        self.score = self.judge(names)
 
-@dataclass(frozen=True, eq=False)
-class LinearTerms:
-    """Normal equations of a problem about a point, of each channel c and fold f."""
+    def free(self, names: Iterable[Name]) -> frozenset[int]:
+        return frozenset(k for name in names for k in self.effects[name].parameters)
 
-    theta: Array
-    acting: tuple[Index, ...]
-    squares: tuple[Array, ...]
-    """(F, k, k) of each channel."""
-    products: tuple[Array, ...]
-    """(F, k)."""
-    totals: Array
-    """Weighted squares of the residuals, (C, F)."""
-    counts: Array
-    """Independent measurements, (C, F)."""
-    variance: Array
-    """(C,)."""
-    floor: Array
-    away: Array
-    """Change of a parameter that is not free: its nominal value less that of the point, (K,); NaN where there is
-    none."""
-    prior: Array
-    """Inverse variance of each parameter before any measurement, (K,)."""
-    expected: Array
-    """Expected change of a parameter that is free, (K,)."""
-    low: Array
-    high: Array
-    """Least and largest change of each parameter, (K,)."""
-    _found: dict[frozenset[int], tuple[Array, Array]] = field(default_factory=dict)
-    _fits: dict[frozenset[int], tuple[Index, Array]] = field(default_factory=dict)
+    def price(self, names: Iterable[Name]) -> float:
+        return sum(price_of(self.effects[name]) for name in names)
 
-    @cached_property
-    def _places(self) -> Index:
-        """Place of each parameter among those that act on a channel, −1 for the others, (C, K)."""
-        out = np.full((len(self.acting), len(self.theta)), -1, np.intp)
-        for c, index in enumerate(self.acting):
-            out[c, index] = np.arange(len(index))
-        return out
+    def judge(self, names: Sequence[Name]) -> float:
+        """Negative logarithm of the held-out likelihood plus the price of the effects; less is better.
 
-    def _inside(self, index: Index) -> Iterator[tuple[int, Index, Index]]:
-        """Each channel on which some of these parameters act, which of them do, and their places there."""
-        places = self._places[:, index]
-        there = places >= 0
-        for c in np.flatnonzero(there.any(1) & self.counts.any(1)).tolist():
-            yield c, np.flatnonzero(there[c]), places[c, there[c]]
+        Infinite if an effect with a price ends at a bound: what is not that effect would have it impossible.
+        """
+        free = self.free(names)
+        at = {*self.terms.at_bounds(self.terms.fit(free)).tolist()} & free
+        if at and any(at & {*self.effects[n].parameters} and price_of(self.effects[n]) > 0.0 for n in names):
+            return float("inf")
+        return float(self.terms.cost(free).sum()) + self.price(names)
 
-    @cached_property
-    def _still(self) -> Array:
-        return np.asarray(np.nan_to_num(self.away))
+    def with_needs(self, name: Name, names: Sequence[Name]) -> list[Name]:
+        """These effects, one more and what it needs; what it excludes gives way."""
+        effect = self.effects[name]
+        kept = [n for n in names if n != name and n not in effect.excludes and name not in self.effects[n].excludes]
+        return [*kept, *(need for need in effect.needs if need not in kept and need in self.effects), name]
 
-    def _fit(self, free: frozenset[int]) -> tuple[Index, Array]:
-        """Free parameters (p,) and their changes without each fold, then from all, (F + 1, p)."""
-        if free in self._fits:
-            return self._fits[free]
-        index = np.array(sorted(free), np.intp)
-        folds, size = self.totals.shape[1], len(index)
-        gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
-        still = self._still.copy()
-        still[index] = 0.0
-        moved = np.flatnonzero(still)
-        for c, inside, at in self._inside(index):
-            own, place = -self.products[c][:, at], self._places[c]
-            if len(moved) and len(beside := moved[place[moved] >= 0]):
-                own -= self.squares[c][:, at[:, None], place[beside]] @ still[beside]
-            gram[:, inside[:, None], inside] += self.squares[c][:, at[:, None], at] / self.variance[c]
-            side[:, inside] += own / self.variance[c]
-        whole, right = gram.sum(0), side.sum(0)
-        grams, sides = np.concatenate([whole - gram, whole[None]]), np.concatenate([right - side, right[None]])
-        grams[:, np.arange(size), np.arange(size)] += self.prior[index]
-        sides += self.prior[index] * self.expected[index]
-        self._fits[free] = index, self._bounded(index, grams, sides)
-        return self._fits[free]
+    def without(self, name: Name, names: Sequence[Name]) -> list[Name]:
+        """These effects less one and those that need it."""
+        return [n for n in names if n != name and name not in self.effects[n].needs]
 
-    def _bounded(self, index: Index, grams: Array, sides: Array) -> Array:
-        """Solutions of normal equations (F + 1, p, p) within the bounds: what the whole would have beyond is held there
-        in all of them, and the others are fitted beside it."""
-        low, high = self.low[index], self.high[index]
-        held = low == high
-        values = np.broadcast_to(np.where(held, low, 0.0), sides.shape).copy()
+    def shortlist(self, names: Sequence[Name], offered: Sequence[Name], most: int) -> list[Name]:
+        """Those that promise most beside `names` beyond their price; of the forms of one effect at most two."""
+        falls = self.terms.promises(self.free(names), [self.effects[n].parameters for n in offered])
+        net = falls - [price_of(self.effects[n]) for n in offered]
+        taken = list[Name]()
+        for k in np.argsort(-net).tolist():
+            if len(taken) == most:
+                break
+            if sum(other in self.effects[offered[k]].excludes for other in taken) < 2:
+                taken.append(offered[k])
+        return taken
+
+    def _rest(self, names: Iterable[Name]) -> list[Name]:
+        there = {*names}
+        return [name for name in self.effects if name not in there]
+
+    def step(self, trials: Iterable[Sequence[Name]], bound: float, rise: float = 0.0) -> bool:
+        """Go on with the best of some sets whose score is below a bound, unless the score is no better, or rises by
+        `rise` and more, once the channels are weighed by what it leaves; whether there was one."""
+        best: Sequence[Name] | None = None
+        for trial in trials:
+            if frozenset(trial) not in self.worse and len(trial) <= MOST_EFFECTS:
+                score = self.judge(trial)
+                if score < bound:
+                    best, bound = trial, score
+        if best is None:
+            return False
+        before = self.current, self.terms, self.score
+        self._take(list(best))
+        if self.score >= before[2] + rise:
+            self.worse.add(frozenset(best))
+            self.current, self.terms, self.score = before
+        return True
+
+    def forward(self) -> bool:
+        """Add the effect that helps most, if any pays."""
+        offered = self._rest(self.current)
+        names = self.shortlist(self.current, offered, SHORTLIST) if offered else []
+        return self.step((self.with_needs(name, self.current) for name in names), self.score - self.least)
+
+    def backward(self) -> bool:
+        """Take the effect out that is missed least, if the rest scores as well without it."""
+        trials = (self.without(name, self.current) for name in self.current)
+        return self.step((each for each in trials if self.kept <= {*each}), self.score + AS_GOOD, AS_GOOD)
+
+    def exchange(self) -> bool:
+        """Put one effect in the place of another, or simpler ones together in that of one, if that scores better."""
+        return self.step(self._exchanged(), self.score - self.least)
+
+    def _exchanged(self) -> Iterator[list[Name]]:
+        for name in [each for each in self.current if self.kept <= {*self.without(each, self.current)}]:
+            rest = self.without(name, self.current)
+            offered = self._rest([*rest, name])
+            for other in self.shortlist(rest, offered, EXCHANGED) if offered else ():
+                yield self.with_needs(other, rest)
+            parts = [n for n in self.effects[name].simpler if n in self.effects and n not in rest]
+            if parts:
+                yield self.pruned([*rest, *parts], parts)
+
+    def pair(self) -> bool:
+        """Add two effects of which neither pays without the other, such as friction that grows with a load beside a
+        mass that the model lacks."""
+        return self.step(self._pairs(), self.score - 2.0 * self.least)
+
+    def _pairs(self) -> Iterator[list[Name]]:
+        offered = self._rest(self.current)
+        for name in self.shortlist(self.current, offered, PAIRED) if offered else ():
+            more = self.with_needs(name, self.current)
+            rest = [n for n in self._rest(more) if n not in self.effects[name].excludes]
+            for other in self.shortlist(more, rest, PAIRED) if rest else ():
+                yield self.with_needs(other, more)
+
+    def pruned(self, names: Sequence[Name], doubtful: Sequence[Name]) -> list[Name]:
+        """These effects without those of the doubtful ones that do not pay."""
+        best, kept = self.judge(names), list(names)
         while True:
-            rest = np.flatnonzero(~held)
-            if not len(rest):
-                return np.asarray(values)
-            fixed = np.flatnonzero(held)
-            beside = sides[:, rest] - (grams[:, rest[:, None], fixed] @ values[:, fixed, None])[..., 0]
-            values[:, rest] = _solved(grams[:, rest[:, None], rest], beside)
-            beyond = ~held & ((values[-1] < low) | (values[-1] > high))
-            if not beyond.any():
-                return np.asarray(np.clip(values, low, high))
-            values[:, beyond] = np.clip(values[-1], low, high)[beyond]
-            held |= beyond
+            trials = [self.without(name, kept) for name in doubtful if name in kept]
+            scores = [self.judge(trial) for trial in trials]
+            if not scores or min(scores) >= best:
+                return kept
+            best, kept = min(scores), trials[int(np.argmin(scores))]
 
-    def fit(self, free: Iterable[int], fold: int = -1) -> Array:
-        """Change of all parameters (K,) with some free and the others at their nominal values, without one fold."""
-        index, values = self._fit(frozenset(free))
-        change = self._still.copy()
-        change[index] = values[fold]
-        return change
-
-    def at_bounds(self, change: Array) -> Index:
-        """Parameters whose change (K,) is a bound that leaves room on the other side."""
-        return np.flatnonzero((self.low < self.high) & ((change <= self.low) | (change >= self.high)))
-
-    def left(self, change: Array, fold: int | None = None) -> Array:
-        """Weighted squares that remain after a change of the parameters, (C, F), or of one fold (C,)."""
-        out = self.totals.copy()
-        moved = np.flatnonzero(change)
-        for c, own, at in self._inside(moved):
-            values = change[moved[own]]
-            bent = (self.squares[c][:, at[:, None], at] @ values) @ values
-            out[c] += 2.0 * self.products[c][:, at] @ values + bent
-        out = np.maximum(out, 0.0)
-        return out if fold is None else np.asarray(out[:, fold])
-
-    def costs(self, free: Iterable[int]) -> Array:
-        """Negative logarithm of the held-out likelihood of each channel and fold, (C, F)."""
-        key = frozenset(free)
-        if key not in self._found:
-            folds = self.totals.shape[1]
-            out = self._held_out(key) if folds > 1 else self.left(self.fit(key))
-            total = self.counts.sum(1)
-            mean = np.where(total > 0.0, out.sum(1) / np.maximum(total, 1e-300) + self.floor**2, 1.0)
-            share = out / np.maximum(out.sum(1, keepdims=True), 1e-300)
-            each = 0.5 * self.counts * np.log(mean)[:, None] + 0.5 * (share * total[:, None] - self.counts)
-            self._found[key] = each, np.asarray(0.5 * total * np.log(mean))
-        return self._found[key][0]
-
-    def _held_out(self, free: frozenset[int]) -> Array:
-        """Weighted squares of each fold as it is predicted from the others, (C, F)."""
-        index, values = self._fit(free)
-        still = self._still.copy()
-        still[index] = 0.0
-        beside = np.flatnonzero(still)
-        index = np.concatenate([index, beside])
-        values = np.hstack([values[:-1], np.broadcast_to(still[beside], (len(values) - 1, len(beside)))])
-        out = self.totals.copy()
-        for c, inside, at in self._inside(index):
-            own = values[:, inside]
-            bent = (self.squares[c][:, at[:, None], at] @ own[..., None])[..., 0]
-            out[c] += np.sum(own * (2.0 * self.products[c][:, at] + bent), axis=1)
-        return np.maximum(out, 0.0)
-
-    def cost(self, free: Iterable[int]) -> Array:
-        """The same of each channel, (C,)."""
-        key = frozenset(free)
-        self.costs(key)
-        return self._found[key][1]
-
-    def mean_squares(self, change: Array) -> Array:
-        """Mean square that remains in each channel after a change of the parameters, (C,)."""
-        return np.asarray(self.left(change).sum(1) / np.maximum(self.counts.sum(1), 1e-300))
-
-    def reweighed(self, free: Iterable[int]) -> "LinearTerms":
-        """The same with the scale of each channel that these parameters leave."""
-        free = frozenset(free)
-        squares = self.totals.sum(1) / np.maximum(self.counts.sum(1), 1e-300)
-        for _ in range(REWEIGHINGS):
-            terms = replace(self, variance=squares + self.floor**2, _found={}, _fits={})
-            squares = terms.mean_squares(terms.fit(free))
-        return terms
-
-    @cached_property
-    def _whole(self) -> tuple[Array, ...]:
-        """Squares of each channel over all folds, (k, k)."""
-        return tuple(squares.sum(0) for squares in self.squares)
-
-    @cached_property
-    def _matrix(self) -> tuple[Array, Array]:
-        """Normal equations of all parameters and all channels, (K, K) and (K,)."""
-        size = len(self.theta)
-        gram, side = np.diag(self.prior), np.zeros(size)
-        for c, index in enumerate(self.acting):
-            if len(index) and self.counts[c].any():
-                gram[index[:, None], index] += self._whole[c] / self.variance[c]
-                side[index] -= self.products[c].sum(0) / self.variance[c]
-        return gram, side + self.prior * self.expected
-
-    def curvature(self, own: Index, free: Iterable[int]) -> Array:
-        """Second derivatives of the cost in some parameters, all other free ones adapting, (p, p)."""
-        rest = np.setdiff1d(np.array(sorted(free), np.intp), own)
-        gram = self._matrix[0]
-        onto = gram[np.ix_(rest, own)]
-        return np.asarray(gram[np.ix_(own, own)] - onto.T @ np.linalg.lstsq(gram[np.ix_(rest, rest)], onto, 1e-12)[0])
-
-    def promises(self, free: Iterable[int], candidates: Sequence[tuple[int, ...]]) -> Array:
-        """How far the cost of all rows falls by each group of parameters in addition to free ones, which adapt to it by
-        the present weights, (M,)."""
-        gram, side = self._matrix
-        index = np.array(sorted(free), np.intp)
-        floor = 1e-6 * np.diag(gram) + 1e-300
-        change = self.fit(index.tolist())
-        left = side - gram[:, index] @ change[index]
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
-        scaled = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
-        root = np.linalg.cholesky(scaled)
-        half = np.linalg.solve(root, scale[:, None] * gram[index])
-        adapting = -scale[:, None] * np.linalg.solve(root.T, half)
-        out = np.zeros(len(candidates))
-        widths = np.array([len(each) for each in candidates])
-        for width in np.unique(widths):
-            same = np.flatnonzero(widths == width)
-            own = np.array([candidates[k] for k in same.tolist()], np.intp)
-            taken = np.moveaxis(half[:, own], 0, -1)  # by the free parameters, which adapt
-            blocks = gram[own[:, :, None], own[:, None, :]] - taken @ taken.swapaxes(1, 2)
-            blocks += floor[own][:, :, None] * np.eye(width)
-            aim = left[own]
-            low, high = self.low[own], self.high[own]
-            held = low == high
-            fixed = np.where(held, low, 0.0)
-            beside = np.where(held, fixed, aim - (blocks @ fixed[..., None])[..., 0])
-            free_blocks = np.where(held[:, :, None] | held[:, None, :], np.eye(width), blocks)
-            values = np.clip(np.linalg.solve(free_blocks, beside[..., None])[..., 0], low, high)
-            out[same] = self._falls(change, index, (adapting[:, own] * values).sum(2).T, own, values)
-        return out
-
-    def _falls(self, change: Array, index: Index, moved: Array, own: Index, values: Array) -> Array:
-        """Falls of the cost of all rows from a change (K,) on, by changes of free parameters (p,), (M, p), and of M
-        groups of others, (M, w) each, at these values."""
-        out, before = np.zeros(len(own)), self.left(change).sum(1)
-        for c, place in enumerate(self._places):
-            count = self.counts[c].sum()
-            if not count or not len(self.acting[c]):
-                continue
-            whole, inside, at = self._whole[c], place[index] >= 0, place[own]
-            i, d, x = place[index][inside], moved[:, inside], np.where(at >= 0, values, 0.0)
-            slope = 2.0 * (self.products[c].sum(0) + whole @ change[self.acting[c]])
-            bent = ((whole[at[:, :, None], at[:, None, :]] @ x[..., None])[..., 0] * x).sum(1)
-            bent += (d @ whole[np.ix_(i, i)] * d).sum(1) + 2.0 * ((whole[i][:, at] * x).sum(2).T * d).sum(1)
-            after = np.maximum(before[c] + (slope[at] * x).sum(1) + d @ slope[i] + bent, 0.0)
-            floor = count * self.floor[c] ** 2 + 1e-300
-            out += 0.5 * count * np.log((before[c] + floor) / (after + floor))
-        return out
-
-    def freedom(self, parameters: Sequence[int]) -> float:
-        """Effective number of parameters: those whose plausible size would show in the data; at least 1."""
-        own = np.array(parameters, np.intp)
-        gram = np.zeros((len(own), len(own)))
-        for c, place in enumerate(self._places):
-            if np.all(place[own] >= 0):
-                gram += self.squares[c].sum(0)[np.ix_(place[own], place[own])] / self.floor[c] ** 2
-        spread = 1.0 / np.sqrt(np.maximum(self.prior[own], 1e-300))
-        values = np.maximum(np.linalg.eigvalsh(gram * spread * spread[:, None]), 0.0)
-        return max(float(np.sum(values / (1.0 + values))), 1.0)
-
-
-def _solved(grams: Array, sides: Array) -> Array:
-    """Solutions of normal equations (…, p, p) and (…, p)."""
-    if not sides.shape[-1]:
-        return sides.copy()
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(grams, axis1=-2, axis2=-1), 1e-300))
-    scaled = grams * scale[..., None, :] * scale[..., None] + RIDGE * np.eye(sides.shape[-1])
-    return np.asarray(scale * np.linalg.solve(scaled, (scale * sides)[..., None])[..., 0])
-
-
-def fold_sums(
-    slopes: Iterable[Array], residual: Array, weight: Array, fold: Index
-) -> tuple[tuple[Array, ...], tuple[Array, ...], Array, Array]:
-    """Squares and products of normal equations, squares of the residuals and weights, of each channel and fold.
-
-    Derivatives of each channel's residual (k, N), residuals (C, N), weights of rows (C, N), fold of each row (N,).
-    """
-    members = [np.flatnonzero(fold == f) for f in range(int(fold.max()) + 1)]
-    squares, products = list[Array](), list[Array]()
-    for x, y, w in zip(slopes, residual, weight, strict=True):
-        squares.append(np.stack([(x[:, m] * w[m]) @ x[:, m].T for m in members]))
-        products.append(np.stack([x[:, m] @ (w[m] * y[m]) for m in members]))
-    totals, counts = (np.stack([z[:, m].sum(1) for m in members], axis=1) for z in (weight * residual**2, weight))
-    return tuple(squares), tuple(products), totals, counts
-
-
-def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
-    """Normal equations about a point; `folds` is the fold of each block."""
-    variance = scale_of(problem, about.residual)
-    weight = problem.weight * robust_weight(about.residual, variance, problem.freedom)
-    fold = folds[problem.block]
-    squares, products, totals, _ = fold_sums(about.slopes, about.residual, weight, fold)
-    counts = np.stack([problem.weight[:, fold == f].sum(1) for f in range(totals.shape[1])], axis=1)
-    away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
-    unbounded = np.full(len(away), np.inf)
-    return LinearTerms(
-        about.theta, about.acting, squares, products, totals, counts, variance, problem.floor, away,
-        precision(problem), np.nan_to_num(away), -unbounded, unbounded,
-    )  # fmt: skip
-
-
-def price_of(effect: Effect[Name]) -> float:
-    return PRICE * len(effect.parameters) if effect.price is None else effect.price
+    def run(self) -> list[Name]:
+        """Forward and backward steps until none helps, then exchanges, then again."""
+        for _ in range(ROUNDS):
+            while self.forward():
+                while self.backward():
+                    pass
+            while self.backward():
+                pass
+            if not self.exchange() and not self.pair():
+                break
+        return self.current

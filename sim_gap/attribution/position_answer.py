@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE
+from gcomp.estimate.linear_terms import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.verdict import NEAR
 from sim_gap.model.load import SimModel

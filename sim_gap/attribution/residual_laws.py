@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE, SIGNIFICANT
+from gcomp.estimate.linear_terms import PRICE, SIGNIFICANT
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.residuals.disregarded_rows import regimes_left_out, slides
 from sim_gap.residuals.layout import Row

@@ -8,8 +8,8 @@ from operator import itemgetter
 
 import numpy as np
 
-from gcomp.estimate.choice import PRICE
-from gcomp.estimate.exchange import AS_GOOD as NO_FALL
+from gcomp.estimate.choice import AS_GOOD as NO_FALL
+from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge

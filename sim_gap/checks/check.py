@@ -16,7 +16,7 @@ from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_co
 from armlink.recording.recording import TORQUE_CHANNELS, Recording, default_names, take_joints
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
-from gcomp.estimate.choice import SIGNIFICANT
+from gcomp.estimate.linear_terms import SIGNIFICANT
 from sim_gap.checks.column_pairs import follows_position, require_commands, sound_velocity
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding, refuse

@@ -9,7 +9,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE
+from gcomp.estimate.linear_terms import PRICE
 from sim_gap.checks.finding import Kind, RecordingFinding, exchange_option
 
 SAME, ALIKE, APART = 0.9, 0.7, 0.5

@@ -13,7 +13,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, SIGNIFICANT
+from gcomp.estimate.linear_terms import PRICE, SIGNIFICANT
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order, zero_offsets
 from sim_gap.checks.sound_arm import CERTAIN_COST, ChannelMotion, likelihood, quick_costs

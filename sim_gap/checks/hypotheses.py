@@ -11,7 +11,7 @@ import numpy as np
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
-from gcomp.estimate.choice import REWEIGHINGS
+from gcomp.estimate.linear_terms import REWEIGHINGS
 from sim_gap.checks.finding import Kind
 from sim_gap.checks.sound_arm import ERROR_STD, ChannelMotion
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gcomp.arm.rigid_body import CREEP, INERTIAL, RigidArm
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms, fold_sums
+from gcomp.estimate.linear_terms import PRICE, REWEIGHINGS, LinearTerms, fold_sums
 from sim_gap.checks.positions import beyond_range
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import FOLDS

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, Effect, LinearTerms, price_of, terms_of
-from gcomp.estimate.exchange import EffectChoice
+from gcomp.estimate.choice import EffectChoice
+from gcomp.estimate.linear_terms import PRICE, Effect, LinearTerms, price_of, terms_of
 from gcomp.estimate.problem import linearise
 from gcomp.estimate.solve import cost_of, prior_cost, scale_of
 from sim_gap.position_gap.fit import Group, Layout, LoopFit, LoopSearch, Place, residuals, rms_on

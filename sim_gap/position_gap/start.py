@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE
+from gcomp.estimate.linear_terms import PRICE
 from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, Progress, costs_of, worth
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals

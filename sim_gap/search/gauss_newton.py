@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from gcomp.arm.inertials import pseudo_inertia
 from gcomp.arm.rigid_body import RigidArm
 from gcomp.arrays import Array
-from gcomp.estimate.exchange import AS_GOOD
+from gcomp.estimate.choice import AS_GOOD
 from sim_gap.search.column_store import ColumnStore, inertial_change
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations

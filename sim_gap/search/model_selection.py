@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from gcomp.estimate.choice import PRICE
+from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet

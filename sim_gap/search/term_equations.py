@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, Effect, LinearTerms, fold_sums
-from gcomp.estimate.exchange import EffectChoice
+from gcomp.estimate.choice import EffectChoice
+from gcomp.estimate.linear_terms import PRICE, Effect, LinearTerms, fold_sums
 from sim_gap.effects.effect import Key, Ratings
 from sim_gap.residuals.residual_set import FEWEST, ResidualSet
 from sim_gap.search.column_store import ColumnStore

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import SIGNIFICANT
+from gcomp.estimate.linear_terms import SIGNIFICANT
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 
 HEADROOM = 10.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from gcomp.estimate.choice import PRICE, Effect, LinearTerms, price_of
-from gcomp.estimate.exchange import EffectChoice
+from gcomp.estimate.choice import EffectChoice
+from gcomp.estimate.linear_terms import PRICE, Effect, LinearTerms, price_of
 
 FOLDS, ROWS = 5, 200
 
