@@ -1,4 +1,4 @@
-"""What effects are worth: the likelihood of rows that are held out, and a price for each parameter.
+"""Worth of effects: the likelihood of rows that are held out, and a price for each parameter.
 
 All is linear about one point, so that a choice of effects (`choice`) takes no further evaluation of the problem.
 """
