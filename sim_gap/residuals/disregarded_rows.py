@@ -151,14 +151,16 @@ def fast_gaps(data: ResidualSet, recordings: Sequence[Recording]) -> list[Locati
         for channel, name in CHANNELS.items():
             values = getattr(recording, name)
             for joint in range(arm.n) if values is not None else ():
-                found = _peak(recording.t, values[:, joint], recording.position @ inertia[joint])
-                row = (channel, joint)
-                if found and (row not in best or found[1] > best[row].rms):
-                    hz, rms, share, asked = found
-                    noise = float(np.hypot(data.floor.get(row, 0.0), asked))
-                    clear = rms > max(data.relevant_nm, 2.0 * noise)
-                    best[row] = Location(arm.names[joint], channel, "band", rms, noise, share, hz, clear)
-    return [each for each in best.values() if each.clear]
+                row, moved = (channel, joint), recording.position @ inertia[joint]
+                noise = data.floor.get(row, 0.0)
+                least = max(data.relevant_nm, 2.0 * noise, best[row].rms if row in best else 0.0)
+                for rms, hz, band, share in _peaks(recording.t, values[:, joint]):
+                    if rms <= least:
+                        break
+                    if rms > 2.0 * np.hypot(noise, _asked(recording.t, moved, band)):
+                        best[row] = Location(arm.names[joint], channel, "band", rms, noise, share, hz, clear=True)
+                        break
+    return list(best.values())
 
 
 def _mass_matrix(arm: RigidArm, q: Array) -> Array:
@@ -167,29 +169,37 @@ def _mass_matrix(arm: RigidArm, q: Array) -> Array:
     return arm.torque(np.tile(q, (arm.n, 1)), none, rows, np.zeros(3)) + np.diag(arm.armature)
 
 
-def _peak(t: Array, values: Array, moved: Array) -> tuple[float, float, float, float] | None:
-    """Frequency [Hz], RMS and share of the power above the band of the strongest line or resonance there, if any, and
-    the RMS that a motion with the momentum's integral `moved` [kg·m²] asks for in it."""
-    there = np.isfinite(values) & np.isfinite(moved)
+def _spectrum(t: Array, values: Array) -> tuple[Array, Array] | None:
+    """Frequencies [Hz] and power spectral density of readings; None of too few."""
+    there = np.isfinite(values)
     if there.sum() < 1024:
         return None
     own = t[there]
     step = float(np.median(np.diff(own)))
-    even = np.arange(own[0], own[-1], step)
-    (frequency, density), (_, motion) = (spectrum(np.interp(even, own, x[there]), 1.0 / step) for x in (values, moved))
+    return spectrum(np.interp(np.arange(own[0], own[-1], step), own, values[there]), 1.0 / step)
+
+
+def _asked(t: Array, moved: Array, band: tuple[float, float]) -> float:
+    """RMS torque [N·m] in a band [Hz] that inertia times position `moved` (K,) [kg·m²] asks for; 0 if unknown."""
+    frequency, density = _spectrum(t, moved) or np.zeros((2, 2))
+    inside = (frequency >= band[0]) & (frequency <= band[1])
+    return float(np.sqrt(np.sum(density[inside] * (2.0 * np.pi * frequency[inside]) ** 4) * frequency[1]))
+
+
+def _peaks(t: Array, values: Array) -> list[tuple[float, float, tuple[float, float], float]]:
+    """RMS, frequency [Hz], the band that it fills [Hz], and share of the power above the pass band of each line or
+    resonance there, the strongest first."""
+    if (made := _spectrum(t, values)) is None:
+        return []
+    frequency, density = made
     smooth = np.log(np.convolve(density, np.ones(SMOOTHED_BINS) / SMOOTHED_BINS, mode="same") + 1e-300)
     peaks, shapes = find_peaks(smooth, prominence=np.log(PEAK_HEIGHT))
     left, right = peak_widths(smooth, peaks, rel_height=0.9)[2:]
-    best: tuple[float, float, float] | None = None
+    total, found = float(np.sum(density[frequency > BAND_HZ]) * frequency[1]), []
     for k in np.flatnonzero(frequency[peaks] > LOWEST_PEAK_HZ).tolist():
         inside = slice(int(np.floor(left[k])), int(np.ceil(right[k])) + 1)
         foot = float(np.exp(smooth[peaks[k]] - shapes["prominences"][k]))
         power = float(np.sum(np.maximum(density[inside] - foot, 0.0)) * frequency[1])
-        if best is None or power > best[1]:
-            asked = float(np.sum(motion[inside] * (2.0 * np.pi * frequency[inside]) ** 4) * frequency[1])
-            best = float(frequency[inside][np.argmax(density[inside])]), power, asked
-    if best is None:
-        return None
-    total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
-    hz, power, asked = best
-    return hz, float(np.sqrt(power)), min(power / max(total, 1e-300), 1.0), float(np.sqrt(asked))
+        own, share = frequency[inside], min(power / max(total, 1e-300), 1.0)
+        found.append((float(np.sqrt(power)), float(own[np.argmax(density[inside])]), (own[0], own[-1]), share))
+    return sorted(found, reverse=True)
