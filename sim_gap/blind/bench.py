@@ -5,11 +5,13 @@ Answers are hashed before a label is opened; labels are read only if the hashes 
 
 import hashlib
 import json
+import os
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -145,12 +147,23 @@ def _answer(name: str, job: Callable[[], Json]) -> tuple[str, Json]:
 
 def _run_apart(jobs: Sequence[Callable[[], Made]], workers: int) -> Iterator[Made]:
     """Results in the order in which they come from `workers` processes."""
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
         futures = [pool.submit(job) for job in jobs]
         try:
             yield from (future.result() for future in as_completed(futures))
         finally:  # after a failure, pending jobs are not begun
             pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker ends when the process that began it is killed."""
+
+    def watch() -> None:
+        if (parent := parent_process()) is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 # ---- the seal
