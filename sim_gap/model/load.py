@@ -16,8 +16,6 @@ from gcomp.arm.inertials import fixed_body_parameters
 from gcomp.arm.model_file import HAND, coupled_joints, linear_part, links_of_bodies, upwards
 from gcomp.arm.rigid_body import RigidArm, Tendons
 from gcomp.arrays import Array
-from sim_bus.effects.state import Imperfections
-from sim_bus.physics.mjcf import build_model
 from sim_gap.model.solver_friction import creep_speeds
 
 
@@ -98,6 +96,10 @@ def nominal_model(path: Path) -> Any:
     if arm.model_path is not None and not (isinstance(arm.sim, dict) and arm.sim.get("links")):
         return arm.model_path
     if arm.sim is not None:
+        # only here: a diagnosis of other models, and so the sealed check, goes without the simulated arm
+        from sim_bus.effects.state import Imperfections
+        from sim_bus.physics.mjcf import build_model
+
         spec = build_model(arm, Imperfections(arm.joint_names)).spec
         for joint in spec.joints:
             joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
