@@ -9,8 +9,8 @@ CROWD_PER_JOINT, CROWD = 5, 30
 OWN_RATE = 250.0
 """Drives that send by their own clock do so 5 times per joint at this rate at most [Hz], whatever the cycle."""
 CROWDED_CYCLES = 10
-"""Cycles at twice that limit or more that mean a babbling node, or more of less. A backlog, of a host or a device that
-had no processor for a while, is less."""
+"""Cycles at twice that limit or more that mean a babbling node; of less crowded ones it takes more. What is less in all
+is a backlog, of a host or a device that had no processor for a while."""
 DOUBLE_CYCLES = 3
 """Consecutive cycles with two readings of one joint that mean a second node with its id."""
 FORGIVEN = 250

@@ -97,7 +97,7 @@ class Environment:
     """For bus and record store."""
     port: BusAccess
     disk: Worker
-    """For all work on the state directory: the only thread that writes there."""
+    """For all work on the state directory but the diagnosis of the day, which has a thread and a folder of its own."""
     aside: Worker
     """For work that takes seconds and can be pickled."""
 

@@ -19,7 +19,7 @@ PRICE = 4.0
 brings log m of rows that are fitted (risk inflation criterion, Foster and George, Annals of Statistics 22, 1994), and
 one less of rows that are held out. A six-joint arm has m = 150: log 150 − 1 = 4.0."""
 SIGNIFICANT = 2.0
-"""Standard errors over the blocks by which an effect has to pay: 98 % of a normal distribution, one-sided."""
+"""Standard errors from which something is told from chance: 98 % of a normal distribution, one-sided."""
 RIDGE = 1e-10
 """Addition to normal equations of columns of unit length, for columns that are nearly alike."""
 REWEIGHINGS = 3
@@ -69,7 +69,7 @@ class LinearTerms:
     low: Array
     high: Array
     """Least and largest change of each parameter, (K,)."""
-    _found: dict[frozenset[int], tuple[Array, Array]] = field(default_factory=dict)
+    _found: dict[frozenset[int], Array] = field(default_factory=dict)
     _fits: dict[frozenset[int], tuple[Index, Array]] = field(default_factory=dict)
 
     @cached_property
@@ -155,18 +155,15 @@ class LinearTerms:
         out = np.maximum(out, 0.0)
         return out if fold is None else np.asarray(out[:, fold])
 
-    def costs(self, free: Iterable[int]) -> Array:
-        """Negative logarithm of the held-out likelihood of each channel and fold, (C, F)."""
+    def cost(self, free: Iterable[int]) -> Array:
+        """Negative logarithm of the held-out likelihood of each channel, (C,)."""
         key = frozenset(free)
         if key not in self._found:
-            folds = self.totals.shape[1]
-            out = self._held_out(key) if folds > 1 else self.left(self.fit(key))
+            out = self._held_out(key) if self.totals.shape[1] > 1 else self.left(self.fit(key))
             total = self.counts.sum(1)
             mean = np.where(total > 0.0, out.sum(1) / np.maximum(total, 1e-300) + self.floor**2, 1.0)
-            share = out / np.maximum(out.sum(1, keepdims=True), 1e-300)
-            each = 0.5 * self.counts * np.log(mean)[:, None] + 0.5 * (share * total[:, None] - self.counts)
-            self._found[key] = each, np.asarray(0.5 * total * np.log(mean))
-        return self._found[key][0]
+            self._found[key] = np.asarray(0.5 * total * np.log(mean))
+        return self._found[key]
 
     def _held_out(self, free: frozenset[int]) -> Array:
         """Weighted squares of each fold as it is predicted from the others, (C, F)."""
@@ -182,12 +179,6 @@ class LinearTerms:
             bent = (self.squares[c][:, at[:, None], at] @ own[..., None])[..., 0]
             out[c] += np.sum(own * (2.0 * self.products[c][:, at] + bent), axis=1)
         return np.maximum(out, 0.0)
-
-    def cost(self, free: Iterable[int]) -> Array:
-        """The same of each channel, (C,)."""
-        key = frozenset(free)
-        self.costs(key)
-        return self._found[key][1]
 
     def mean_squares(self, change: Array) -> Array:
         """Mean square that remains in each channel after a change of the parameters, (C,)."""

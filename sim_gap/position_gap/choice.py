@@ -177,9 +177,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     for number in range(ROUNDS):
         progress(f"round {number + 1}: testing {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked, levels)
-        found = EffectChoice(
-            about.terms, about.effects, [name for name in names if name in about.effects], kept=kept
-        ).run()
+        found = EffectChoice(about.terms, about.effects, names, kept=kept).run()
         if number == 0:
             looked = {*promising(about, names), *found, *names}
         made = search.improve(entered(search, about.moved(found)), FITTING)
