@@ -108,9 +108,10 @@ def _at_bounds(estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
 
 def _common_factor(found: Sequence[Cause], estimate: EffectEstimate, fit: ResidualSet) -> tuple[str, ...]:
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
-    if any(CONSTANT in cause.confounded_with for cause in found if cause.effect in (MASSES, BODY)):
+    alike = {MASSES: CONSTANT, BODY: CONSTANT, CONSTANT: MASSES}
+    if cause := next((each for each in found if alike.get(each.effect) in each.confounded_with), None):
         return (
-            f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
+            f"{cause.effect}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
             "constants were wrong by one factor, the recordings would look the same; creep sweeps with a weighed mass "
             "show whether the masses or the constants are wrong",
         )

@@ -13,7 +13,7 @@ from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
+from sim_gap.search.term import BODY, CONSTANT, INERTIA, MASSES, Term
 from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
 AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
@@ -75,17 +75,19 @@ class Rivals:
         missed = {term: choice.judge(choice.without(term, choice.current)) for term in present}
         most = max(present, key=lambda term: (missed[term], term.place, term.shape), default=None)
         evidence, rivals = self._replaced(most) if most else (0.0, [])
-        return max(evidence, 0.0), tuple(dict.fromkeys([*[CONSTANT] * self._may_be_constants(terms), *rivals]))
+        return max(evidence, 0.0), tuple(dict.fromkeys([*self._by_one_factor(effect), *rivals]))
 
-    def _may_be_constants(self, terms: Sequence[Term]) -> bool:
-        """Whether other constants of all motors, at the price of one effect, explain as much as all masses named."""
-        choice = self.choice
-        masses = [t for t in choice.current if t.effect in (MASSES, "link.inertia", BODY) and not t.bound]
-        if not {*terms} & {*masses} or (layout := choice.equations.layout).sensor:
-            return False
-        drives = [t for t in choice.effects if t.effect == CONSTANT and t not in choice.current]
-        other = [*(t for t in choice.current if t not in masses), *drives]
-        return len(drives) == layout.n and choice.loss(choice.judge(other) - choice.price(drives[1:])) < AS_GOOD
+    def _by_one_factor(self, effect: str) -> list[str]:
+        """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,
+        if they explain as much at the price of one effect: motor torque alone tells their products."""
+        choice, links = self.choice, (MASSES, INERTIA, BODY)
+        if effect not in (*links, CONSTANT) or choice.equations.layout.sensor:
+            return []
+        gone, others = (links, (CONSTANT,)) if effect in links else ((CONSTANT,), (MASSES, INERTIA))
+        rest = [term for term in choice.current if term.effect not in gone or term.bound]
+        more = [term for term in choice.effects if term.effect in others and term not in rest]
+        score = choice.judge([*rest, *more]) - choice.price(more[1:])
+        return [others[0]] if choice.loss(score) < AS_GOOD else []
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""

@@ -110,6 +110,7 @@ class EffectEstimate:
         own = np.arange(self.equations.size)
         bread[own, own] += self.linear.prior
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
+        scale[[*self.equations.fixed.values()]] = 0.0  # what stands beside a term's columns is no parameter
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
         systematic = SYSTEMATIC**2 * float(self.linear.counts.sum()) / max(len(self._jacobian), 1) * inverse
         background = np.zeros(size)

@@ -13,7 +13,7 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge
-from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
+from sim_gap.search.term import BODY, CONSTANT, INERTIA, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
 
@@ -37,10 +37,10 @@ def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     effect after the other may end with one constant as the model has it, and all masses changed in proportion.
     """
     chosen = {term.effect for term in choice.current}
-    if choice.equations.layout.sensor is not None or CONSTANT not in chosen:
+    if choice.equations.layout.sensor is not None or chosen.isdisjoint((CONSTANT, MASSES)):
         return []
     drives = [term for term in offered if term.effect == CONSTANT]
-    links = (CONSTANT, MASSES, "link.inertia", BODY)
+    links = (CONSTANT, MASSES, INERTIA, BODY)
     return [*drives, *(term for term in choice.current if term.effect not in links)]
 
 
@@ -54,7 +54,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
         choice = again if again.score < choice.score else choice
     if start := every_constant(choice, offered):
         again = search_again(store, start, offered, frozenset({CONSTANT}))
-        together = PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)  # of one effect that few arms have
+        together = PRICE * effects()[CONSTANT].plausibility.prior_penalty  # of one effect that few arms have
         choice = again if again.score + together < choice.score else choice
     for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
@@ -76,7 +76,6 @@ def search_again(
         others = [term for term in offered if term.key not in keys]
         equations = TermEquations(about, [*terms, *relinearised_in_place(about, terms, others)])
         choice = TermChoice(equations, terms, usual, AGAIN * equations.measurements)
-        keys = {term.key for term in choice.current}
         choice.run()
         if {term.key for term in choice.current} == keys:
             break

@@ -73,7 +73,7 @@ class Term:
         return tuple((name, self.place) for name in self.form.needs)
 
 
-CONSTANT, MASSES, BODY = "actuator.gain", "link.mass_moment", "link.payload"
+CONSTANT, MASSES, INERTIA, BODY = "actuator.gain", "link.mass_moment", "link.inertia", "link.payload"
 """Recordings of motor torque alone know these only up to a common factor: with links twice as heavy and every torque
 constant twice as large, the drives report the same."""
 

@@ -91,16 +91,17 @@ class TermEquations:
                 for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
-            price = 0.0 if term.effect in usual or likely.every_joint else self.price(term)
+            certain = likely.every_joint and not self.ratings.modelled(term)
+            price = 0.0 if certain else self.price(term, rare=term.effect not in usual)
             numbers = tuple(self.index([term]).tolist())
             out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
         return out
 
-    def price(self, term: Term) -> float:
+    def price(self, term: Term, rare: bool = True) -> float:
         """Price of a term: of its effective coefficients, its shape but for numbers of joints, and of being rare."""
         form = term.form
         shape = sum(i not in form.hints.discrete for i in range(len(term.shape))) * (form.hints.linearised_at is None)
-        return PRICE * (self.linear.freedom(self.at[term].tolist()) + shape + form.plausibility.prior_penalty)
+        return PRICE * (self.linear.freedom(self.at[term].tolist()) + shape + rare * form.plausibility.prior_penalty)
 
     def log_squares(self, change: Array) -> float:
         """Σ ½ log(R² + floor²) over the rows, R² the mean square that terms with these coefficients (P,) leave."""
@@ -175,6 +176,11 @@ class Rated:
         parts = [np.abs(s.model).max(0) + np.abs([*s.reading.values()]).max((0, 1)) for s in data.signals]
         self.torque = np.asarray(np.max(parts, axis=0))
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
+
+    def modelled(self, term: Term) -> bool:
+        """Whether the nominal model has friction or a rotor at the joint of a term that says more of it."""
+        friction, damping, armature = self.joint[:, term.place].tolist()
+        return armature > 0.0 if term.effect == "actuator.rotor_inertia" else friction + damping > 0.0
 
     def of(self, term: Term) -> Ratings:
         friction, damping, armature = self.joint[:, term.place].tolist()
