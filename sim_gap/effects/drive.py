@@ -58,7 +58,6 @@ EFFECTS = (
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor", of_motion=True),
         Plausibility(
             every_joint=True,
-            prior_penalty=0,
             # geared drives are matched to their load within a factor of some
             prior_std=lambda signals, _place: signals.arm.stretched_inertia,
             bounds=lambda ratings, _shape: (-ratings.armature, np.inf),

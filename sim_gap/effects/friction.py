@@ -81,16 +81,12 @@ EFFECTS = (
     InverseEffect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint], of_motion=True),
-        Plausibility(
-            every_joint=True, prior_penalty=0, background_std=0.03, background_nm=True, bounds=_dry_above_nominal
-        ),
+        Plausibility(every_joint=True, background_std=0.03, background_nm=True, bounds=_dry_above_nominal),
     ),
     InverseEffect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint], of_motion=True),
-        Plausibility(
-            every_joint=True, prior_penalty=0, background_std=0.02, background_nm=True, bounds=_viscous_above_nominal
-        ),
+        Plausibility(every_joint=True, background_std=0.02, background_nm=True, bounds=_viscous_above_nominal),
     ),
     InverseEffect(
         "friction.stribeck",

@@ -31,10 +31,11 @@ def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
 
 
 def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
-    """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is chosen.
+    """Every drive's torque constant free, the links as in the model, all else as chosen; none if neither a constant nor
+    a mass is chosen.
 
     Where motor torque alone is recorded, one drive's constant is as doubtful as another's. A search that adds one
-    effect after the other may end with one constant as the model has it, and all masses changed in proportion.
+    effect after the other may end with one constant as the model has it, or all, and masses changed in proportion.
     """
     chosen = {term.effect for term in choice.current}
     if choice.equations.layout.sensor is not None or chosen.isdisjoint((CONSTANT, MASSES)):

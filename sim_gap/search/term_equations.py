@@ -78,7 +78,8 @@ class TermEquations:
         return np.concatenate([*(self.at[term] for term in terms), *beside, np.zeros(0, np.intp)]).astype(np.intp)
 
     def effects(self, usual: Collection[str] = ()) -> dict[Term, Effect[Term]]:
-        """Every term as an effect of the choice; those that are `usual` on this arm are not charged for."""
+        """Every term as an effect of the choice; those that are `usual` on this arm are not charged for being rare,
+        and what every joint has, for nothing where the model has none."""
         forms: dict[Key, set[Term]] = {}
         for term in self.terms:
             forms.setdefault(term.key, set()).add(term)
@@ -91,8 +92,8 @@ class TermEquations:
                 for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
-            certain = likely.every_joint and not self.ratings.modelled(term)
-            price = 0.0 if certain else self.price(term, rare=term.effect not in usual)
+            known = likely.every_joint and not self.ratings.modelled(term)
+            price = 0.0 if known else self.price(term, rare=not (likely.every_joint or term.effect in usual))
             numbers = tuple(self.index([term]).tolist())
             out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
         return out
@@ -178,9 +179,9 @@ class Rated:
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
 
     def modelled(self, term: Term) -> bool:
-        """Whether the nominal model has friction or a rotor at the joint of a term that says more of it."""
-        friction, damping, armature = self.joint[:, term.place].tolist()
-        return armature > 0.0 if term.effect == "actuator.rotor_inertia" else friction + damping > 0.0
+        """Whether the nominal model has friction, or a rotor, where a term has more of it."""
+        friction, damping, armature = self.joint[:, term.place]
+        return bool(armature > 0.0 if term.effect == "actuator.rotor_inertia" else friction + damping > 0.0)
 
     def of(self, term: Term) -> Ratings:
         friction, damping, armature = self.joint[:, term.place].tolist()
