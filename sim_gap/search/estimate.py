@@ -131,7 +131,7 @@ class EffectEstimate:
         if (count := len(ends)) < 2:
             return np.ones(len(whole))
         of_recordings = np.add.reduceat(scores, [0, *(blocks[ends[:-1] - 1] + 1).tolist()], axis=0)
-        own = np.maximum(np.diag(whole), 1e-300)
+        own = np.where(np.diag(whole) > 0.0, np.diag(whole), 1.0)
         both = (np.diag(_sandwich(inverse, each)) for each in (of_recordings, scores))
         excess = np.maximum(np.subtract(*both), 0.0)
         freedom = (own + excess) ** 2 / (own**2 / self._freedom + excess**2 / (count - 1))

@@ -92,10 +92,12 @@ class TermEquations:
                 for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
-            known = likely.every_joint and not self.ratings.modelled(term)
-            price = 0.0 if known else self.price(term, rare=not (likely.every_joint or term.effect in usual))
-            numbers = tuple(self.index([term]).tolist())
-            out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
+            everywhere = likely.every_joint
+            free = everywhere and not self.ratings.modelled(term)
+            price = 0.0 if free else self.price(term, rare=not everywhere and term.effect not in usual)
+            out[term] = Effect(
+                term, tuple(self.index([term]).tolist()), needs, price, excluded, simpler, everywhere=everywhere
+            )
         return out
 
     def price(self, term: Term, rare: bool = True) -> float:
