@@ -22,9 +22,9 @@ SHAPE_STEP = 1e-2
 """Step of the differences in a shape, as a share of it; accuracy to which it is found between its neighbours."""
 LEAST_LEVER_M = 0.01
 """Least distance of a link's centre of mass from its joint's axis [m] for judging errors of its moment."""
-SYSTEMATIC = 0.3
-"""Share of a row's residual and of its relevance floor that can mimic an effect, independent of the recording's
-length."""
+SYSTEMATIC = 0.15
+"""Share of a row's residual and of its relevance floor that mimics an effect, standard deviation, however long the
+recording is: calibrated on sealed cases (docs/theory.md, section 12)."""
 
 
 def _sandwich(inverse: Array, scores: Array) -> Array:

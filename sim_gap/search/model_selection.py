@@ -92,9 +92,9 @@ def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term]
     return likely_shapes(choice), choice.current
 
 
-AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
+AGAIN = -0.5 * float(np.log(1.0 - (2.0 * SYSTEMATIC) ** 2))
 """Least fall of the score, per independent measurement, by a term that only a search about the estimate adds: of one
-row's residual, what no model has can mimic an effect up to the share SYSTEMATIC."""
+row's residual, what no model has can mimic the best of many effects up to the share 2 SYSTEMATIC."""
 SHAPES = 3
 """Number of shapes of an effect at one place that are evaluated about the estimate."""
 ROUNDS = 3
