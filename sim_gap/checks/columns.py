@@ -49,8 +49,18 @@ class HypothesisTest:
         """Whether nothing but the fault can be the reason; what all joints have in common must show without the joint
         that shows it most."""
         common = len(self.falls) > 1 and self.hypothesis.kind in ("clock", "effort_source")
-        others = np.delete(self.falls, self.falls.sum(1).argmax(), axis=0) if common else self.falls
-        return self.fall > self.least and _exceeds_chance(self.falls) and _exceeds_chance(others)
+        return self.fall > self.least and _exceeds_chance(self.falls) and (not common or _exceeds_chance(self._others))
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether a fault that all joints have in common, as no effect of an arm has, is likelier than none."""
+        common = 1 < len(self.falls) == len(self.hypothesis.joints)
+        return common and self.fall > DECISIVE_FALL and _exceeds_chance(self.falls) and _exceeds_chance(self._others)
+
+    @property
+    def _others(self) -> Array:
+        """The falls without those of the joint that shows the fault most."""
+        return np.delete(self.falls, self.falls.sum(1).argmax(), axis=0)
 
 
 def _exceeds_chance(falls: Array) -> bool:
@@ -73,8 +83,8 @@ def find_wrong_columns(
 
     `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
     what is wrong with a position is wrong with theirs. `known` are options that corrected other recordings of the
-    set-up, and need not be chosen again. A finding that is not `corrected` names an unknown number, or more corrections
-    than one that may be right.
+    set-up, and need not be chosen again. A finding that is not `corrected` names an unknown number, more corrections
+    than one that may be right, or one that is likely but not certain.
     """
     as_it_is = likelihood(arm, motion)
     motion = replace(motion, idle=as_it_is.idle)  # no reading becomes a dead one by a correction
@@ -86,7 +96,8 @@ def find_wrong_columns(
     offsets = list(zero_offsets(arm))
     likely.append(offsets[int(_quick_falls(arm, motion, offsets).argmax())])
     tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
-    tests = [test for test in tests if test.is_certain]
+    certain = [test for test in tests if test.is_certain]
+    tests = certain or [test for test in tests if test.is_likely]
     if not tests:
         return None
     most = max(test.fall for test in tests)
@@ -94,7 +105,7 @@ def find_wrong_columns(
     rivals = [test for test in tests if not (np.allclose(best.falls, test.falls) or _is_likelier(best, test))]
     if any(test.hypothesis.of_arm for test in (best, *rivals)):
         return None
-    return _finding(arm, best, rivals)
+    return _finding(arm, best, rivals, bool(certain))
 
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
@@ -149,11 +160,14 @@ def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str])
     return [each for each in found if len(each.joints) > 2]
 
 
-def _finding(arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest]) -> RecordingFinding:
+def _finding(
+    arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest], is_certain: bool
+) -> RecordingFinding:
     own = test.hypothesis
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
     options = list(dict.fromkeys(each.hypothesis.option for each in (test, *alike)))
     shown, more = options[:MOST_OPTIONS], ["another correction"] if len(options) > MOST_OPTIONS else []
-    evidence = own.what + ("; other corrections would explain the recording as well" if len(options) > 1 else "")
-    corrected = own.corrects and len(options) == 1
+    evidence = own.what if is_certain else f"perhaps {own.what}"
+    evidence += "; other corrections would explain the recording as well" if len(options) > 1 else ""
+    corrected = is_certain and own.corrects and len(options) == 1
     return RecordingFinding(own.kind, own.channels[0], joint, evidence, ", or ".join([*shown, *more]), corrected)

@@ -125,12 +125,16 @@ def test_friction_of_all_joints_is_a_motors_and_of_one_is_not():
     assert found(channel(rough, "tau")) is None
 
 
-def test_gravity_that_was_subtracted_is_added():
+@pytest.mark.parametrize(("friction", "certain"), [(0.3, True), (0.8, False)])
+def test_gravity_that_was_subtracted_is_added_and_asked_about_where_friction_hides_it(friction: float, certain: bool):
     still = np.zeros_like(MOTION[1])
-    weightless = sound(0.3) - ARM.torque(MOTION[1], still, still)
+    weightless = sound(friction) - ARM.torque(MOTION[1], still, still)
     finding = found(channel(weightless))
     assert finding is not None
     assert finding.option == "--effort-is without-gravity"
+    assert finding.corrected == certain
+    assert finding.evidence.startswith("perhaps") != certain
+    assert found(channel(sound(friction))) is None
 
 
 @pytest.mark.parametrize("idle", [0, 2])
