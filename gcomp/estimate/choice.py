@@ -53,12 +53,11 @@ class EffectChoice(Generic[Name]):
     def judge(self, names: Sequence[Name]) -> float:
         """Negative logarithm of the held-out likelihood plus the price of the effects; less is better.
 
-        Infinite if an effect that not every system has ends at a bound: what is not that effect would have it
-        impossible.
+        Infinite if an effect with a price ends at a bound: what is not that effect would have it impossible.
         """
         free = self.free(names)
         at = {*self.terms.at_bounds(self.terms.fit(free)).tolist()} & free
-        if at and any(at & {*self.effects[n].parameters} and not self.effects[n].everywhere for n in names):
+        if at and any(at & {*self.effects[n].parameters} and price_of(self.effects[n]) > 0.0 for n in names):
             return float("inf")
         return float(self.terms.cost(free).sum()) + self.price(names)
 

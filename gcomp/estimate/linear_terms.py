@@ -40,8 +40,6 @@ class Effect(Generic[Name]):
     """Effects that give way to it: its own other forms, and those whose columns it contains."""
     simpler: tuple[Name, ...] = ()
     """Simpler effects that together could take its place."""
-    everywhere: bool = False
-    """Whether every system has it, if only as much as a bound allows."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from sim_gap.better_model.native_drives import DRIVE, motors_of, put_drive
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.effects.torque import GRADUAL, is_gradual
 from sim_gap.model.load import SimModel, named_spec, urdf_behind
+from sim_gap.model.solver_friction import solver_parameters
 from sim_gap.search.column_store import inertial_change
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
@@ -106,6 +107,8 @@ def with_effects(
             model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
         elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
+            if term.effect == "friction.coulomb":
+                _rest(model, joint, float(sim.arm.creep[term.place]))
     for place, offset in offsets(estimate, held).items():  # as the sensor counts: stops and spring stay where they are
         joint = sim.joints[place]
         adr = model.jnt_qposadr[joint]
@@ -177,6 +180,14 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
         total = stiffness[joint] + c[0]
         model.qpos_spring[adr] = (stiffness[joint] * model.qpos_spring[adr] - c[1]) / total
         stiffness[joint] = total
+
+
+def _rest(model: Any, joint: int, speed: float) -> None:
+    """Let a joint with friction creep up to a speed [rad/s] as that of the nominal model does, whatever its friction
+    is; without friction there, rest as a gear does."""
+    dof = model.jnt_dofadr[joint]
+    made = solver_parameters(float(model.dof_frictionloss[dof]), speed, float(model.dof_invweight0[dof]))
+    model.dof_solref[dof], model.dof_solimp[dof] = made
 
 
 # ---- its files

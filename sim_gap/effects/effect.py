@@ -130,7 +130,7 @@ class Plausibility:
     """Priors of an effect, and the values that can exist."""
 
     every_joint: bool = False
-    """Whether every joint has it, as all gears rub: where the model has none of it, it costs nothing."""
+    """Whether every joint has it, as all gears rub: then only its size is in question, and it costs nothing."""
     prior_penalty: int = 3
     """Number of extra coefficients that the effect is charged for: 0 if many arms have it, more if few have."""
     prior_mean: float = 0.0

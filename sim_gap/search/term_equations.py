@@ -78,8 +78,7 @@ class TermEquations:
         return np.concatenate([*(self.at[term] for term in terms), *beside, np.zeros(0, np.intp)]).astype(np.intp)
 
     def effects(self, usual: Collection[str] = ()) -> dict[Term, Effect[Term]]:
-        """Every term as an effect of the choice; those that are `usual` on this arm are not charged for being rare,
-        and what every joint has, for nothing where the model has none."""
+        """Every term as an effect of the choice; those that are `usual` on this arm are not charged for being rare."""
         forms: dict[Key, set[Term]] = {}
         for term in self.terms:
             forms.setdefault(term.key, set()).add(term)
@@ -92,12 +91,9 @@ class TermEquations:
                 for keys in (term.beneath, term.form.hints.alternatives(self.layout, term.place, term.shape))
             )
             likely = term.form.plausibility
-            everywhere = likely.every_joint
-            free = everywhere and not self.ratings.modelled(term)
-            price = 0.0 if free else self.price(term, rare=not everywhere and term.effect not in usual)
-            out[term] = Effect(
-                term, tuple(self.index([term]).tolist()), needs, price, excluded, simpler, everywhere=everywhere
-            )
+            price = 0.0 if likely.every_joint else self.price(term, rare=term.effect not in usual)
+            numbers = tuple(self.index([term]).tolist())
+            out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
         return out
 
     def price(self, term: Term, rare: bool = True) -> float:
@@ -179,11 +175,6 @@ class Rated:
         parts = [np.abs(s.model).max(0) + np.abs([*s.reading.values()]).max((0, 1)) for s in data.signals]
         self.torque = np.asarray(np.max(parts, axis=0))
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
-
-    def modelled(self, term: Term) -> bool:
-        """Whether the nominal model has friction, or a rotor, where a term has more of it."""
-        friction, damping, armature = self.joint[:, term.place]
-        return bool(armature > 0.0 if term.effect == "actuator.rotor_inertia" else friction + damping > 0.0)
 
     def of(self, term: Term) -> Ratings:
         friction, damping, armature = self.joint[:, term.place].tolist()
