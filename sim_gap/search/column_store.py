@@ -205,6 +205,15 @@ class ColumnStore:
             self._compute(term)
         return self._offsets[term]
 
+    def masses_in_common(self) -> Columns:
+        """Derivatives by a factor that all masses have in common, (K, 1) per row."""
+        layout, parts = self.data.layout, list[Columns]()
+        for s, one in zip(self.data.signals, self.about, strict=True):
+            plain = {(layout.against_model, j): one.signals.bodies[:, j : j + 1] for j in range(layout.n)}
+            through = self._through(one, Term("link.mass_moment", 0), plain) if self.values else plain
+            parts.append({row: s.filtered(x) for row, x in layout.compared(through).items()})
+        return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
+
     def wide(self, terms: Sequence[Term], row: Row, nonlinear: Collection[Term]) -> Array:
         """Columns of terms in one row, then those beside the nonlinear ones, ordered as `TermEquations.index`."""
         total = sum(self.data.lengths)

@@ -140,19 +140,23 @@ class EffectEstimate:
     def _undetected(self, inverse: Array) -> Array:
         """Contribution to the covariance of undetected errors z of the links' mass moments, (P + S, P + S).
 
-        They shift the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
+        With torque constants that only motor torque tells, all masses have an error in common, too. The errors shift
+        the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
         its usual size and the residual.
         """
         errors = self._errors_of_links()
-        size = errors.shape[1]
+        common = self.store.masses_in_common() if shares_a_factor(self.equations.layout, self.terms) else {}
+        size = errors.shape[1] + bool(common)
         if not size:
             return np.zeros_like(inverse)
         pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
         for (weight, x, residual, _), row in zip(self._jacobian, self.equations.rows, strict=True):
             z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
-            for link in np.flatnonzero(np.any(errors.reshape(-1, 3, size), axis=(1, 2))).tolist():
+            for link in np.flatnonzero(np.any(errors.reshape(-1, 3, errors.shape[1]), axis=(1, 2))).tolist():
                 if row in (columns := self.store.columns(Term("link.mass_moment", link))):
-                    z += columns[row][valid] @ errors[3 * link : 3 * link + 3]
+                    z[:, : errors.shape[1]] += columns[row][valid] @ errors[3 * link : 3 * link + 3]
+            if row in common:
+                z[:, -1:] = NOMINAL * common[row][valid]
             pull += weight * x.T @ z
             own += weight * z.T @ z
             seen += weight * z.T @ residual
@@ -162,21 +166,15 @@ class EffectEstimate:
         return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
 
     def _errors_of_links(self) -> Array:
-        """Changes of all links' mass moments [kg·m] by undetected errors of usual size, (3 n, Z).
-
-        Each component of each link whose mass moment is not a term; with torque constants that only motor torque
-        tells, all masses in common, too.
-        """
+        """Changes of all links' mass moments [kg·m] by undetected errors of usual size, (3 n, Z): of each component of
+        each link whose mass moment is not a term."""
         arm = self.store.data.signals[0].arm
         found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
         usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), LEAST_LEVER_M * arm.inertial[:, 0])
         wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
         share = min(max(NOMINAL, WORSE * wrong), WORST)
         open_links = np.repeat([link not in found for link in range(arm.n)], 3)
-        errors = [np.diag(share * np.repeat(usual, 3))[:, open_links]]
-        if shares_a_factor(self.equations.layout, self.terms):
-            errors.append(NOMINAL * arm.inertial[:, 1:4].reshape(-1, 1))
-        return np.hstack(errors)
+        return np.asarray(np.diag(share * np.repeat(usual, 3))[:, open_links])
 
     def _background(self, term: Term) -> float:
         """Standard deviation of a term's coefficients over sound arms."""

@@ -43,6 +43,20 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
 
 
+@pytest.mark.parametrize("friction", ["", 'frictionloss="0.3"'])
+def test_friction_of_the_written_model_creeps_as_the_nominal_models(tmp_path, friction):
+    """Rows in which a joint creeps are not judged: with more of them a second diagnosis would judge other rows."""
+    (tmp_path / "arm.xml").write_text(THREE.replace("<joint ", f"<joint {friction} "))
+    nominal = load_model(tmp_path / "arm.xml")
+    wrong = Wrong(coulomb=np.array([1.0, 0.8, 0.6]))
+    made = record(nominal.mujoco_model, wrong, seconds=20, rate=50.0, noise=0.002, channels=("tau_motor",))
+    answer = diagnose(tmp_path / "arm.xml", [made])
+    write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml")
+    closed = load_model(tmp_path / "closed.xml").arm
+    np.testing.assert_allclose(closed.frictionloss, wrong.coulomb, rtol=0.01)
+    np.testing.assert_allclose(closed.creep, nominal.arm.creep, rtol=0.05, atol=1e-3)
+
+
 @pytest.mark.long
 def test_a_spring_is_read_by_a_sensor_on_the_link(tmp_path):
     """It acts beside motor and sensor: the model that has it leaves no gap in `tau`, rest and all."""
