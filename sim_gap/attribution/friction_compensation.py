@@ -163,8 +163,9 @@ def _frictions(estimate: EffectEstimate, data: ResidualSet) -> list[_Friction]:
             if row[0] == data.layout.sensor or data.layout.reference(row):
                 continue
             valid = data.valid[row][part]
-            if valid.sum() < FEWEST_MOVING:
-                continue
+            direction = np.rint(s.filtered(s.direction)[valid, row[1]])
+            if len(direction) < FEWEST_MOVING or len({-1.0, 1.0}.intersection(direction)) < 2:
+                continue  # of a joint that goes one way, friction is a constant as any other
             y = (data.values[row] - known[row])[part][valid]
             out.append(_friction(s, row, y, valid, data.blocks[part][valid]))
     return out

@@ -104,12 +104,13 @@ ROUNDS = 3
 def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
     """Every effect of the library at every place and starting shape that these channels can show."""
     layout = data.layout
-    return [
+    every = (
         Term(name, place, shape)
         for name in library
         for place in effects()[name].signature.places(layout)
         for shape in effects()[name].hints.grid(data.signals, place)
-    ]
+    )
+    return list(dict.fromkeys(every))  # a joint that rests has one level where others have several
 
 
 def likely_shapes(choice: TermChoice) -> list[Term]:

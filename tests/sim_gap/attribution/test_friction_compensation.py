@@ -61,6 +61,15 @@ def test_a_channel_that_lacks_it():
 
 
 @pytest.mark.long
+def test_a_joint_that_goes_one_way_tells_nothing_of_it(realdata):
+    """Its friction and any other constant are one: joint 6 was said to have -9.6 N·m of friction."""
+    folder = realdata / "kinova_gen3"
+    names = ["opti_traj_testing1", *(f"joint_{j}_trapez" for j in range(1, 8)), "RecordTrajectory_quadratic"]
+    made = [load_recording(folder / f"{name}.csv.gz") for name in names]
+    assert not diagnose(folder / "sim.urdf", made[:-1], made[-1:], labels=names).friction_compensation
+
+
+@pytest.mark.long
 def test_which_runs_of_the_double_pendulum_had_it(realdata):
     """On in on_c alone; on_c_feedforward is the same run without the compensating part of its command."""
     folder = realdata / "double_pendulum"
