@@ -102,13 +102,11 @@ def with_effects(
     exact = [_set_link(model, sim.joints, link, added[link]) for link in moved]
     changed = tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
     for term in held:
-        c, joint = estimate.of(term), sim.joints[term.place]
+        c = estimate.of(term)
         if term.effect == "base.tilt":
             model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
         elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
-            _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
-            if term.effect == "friction.coulomb":
-                _rest(model, joint, float(sim.arm.creep[term.place]))
+            _joint(model, sim, term.place, term.effect, c, added=estimate.store.data.layout.motor is not None)
     for place, offset in offsets(estimate, held).items():  # as the sensor counts: stops and spring stay where they are
         joint = sim.joints[place]
         adr = model.jnt_qposadr[joint]
@@ -163,9 +161,11 @@ def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:
     return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
 
 
-def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
+def _joint(model: Any, sim: SimModel, place: int, effect: str, c: Array, added: bool) -> None:
     """Give a joint friction, damping, armature or a spring; `added` to what it has of the first three, or if that is
-    the motor's, which a sensor on the link does not read, as much at least."""
+    the motor's, which a sensor on the link does not read, as much at least. Friction creeps up to the speed to which
+    that of the nominal model does; without friction there, it rests as that of a gear."""
+    joint = sim.joints[place]
     dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
     terms = {
         "friction.coulomb": "dof_frictionloss",
@@ -180,14 +180,9 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
         total = stiffness[joint] + c[0]
         model.qpos_spring[adr] = (stiffness[joint] * model.qpos_spring[adr] - c[1]) / total
         stiffness[joint] = total
-
-
-def _rest(model: Any, joint: int, speed: float) -> None:
-    """Let a joint with friction creep up to a speed [rad/s] as that of the nominal model does, whatever its friction
-    is; without friction there, rest as a gear does."""
-    dof = model.jnt_dofadr[joint]
-    made = solver_parameters(float(model.dof_frictionloss[dof]), speed, float(model.dof_invweight0[dof]))
-    model.dof_solref[dof], model.dof_solimp[dof] = made
+    if effect == "friction.coulomb":
+        friction, weight = float(model.dof_frictionloss[dof]), float(model.dof_invweight0[dof])
+        model.dof_solref[dof], model.dof_solimp[dof] = solver_parameters(friction, float(sim.arm.creep[place]), weight)
 
 
 # ---- its files

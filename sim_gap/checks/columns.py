@@ -105,7 +105,7 @@ def find_wrong_columns(
     rivals = [test for test in tests if not (np.allclose(best.falls, test.falls) or _is_likelier(best, test))]
     if any(test.hypothesis.of_arm for test in (best, *rivals)):
         return None
-    return _finding(arm, best, rivals, bool(certain))
+    return _finding(arm, [best, *rivals], bool(certain))
 
 
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
@@ -160,12 +160,11 @@ def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str])
     return [each for each in found if len(each.joints) > 2]
 
 
-def _finding(
-    arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest], is_certain: bool
-) -> RecordingFinding:
-    own = test.hypothesis
+def _finding(arm: RigidArm, tests: Sequence[HypothesisTest], is_certain: bool) -> RecordingFinding:
+    """The finding of the first of tests, beside others that explain the recording as well."""
+    own = tests[0].hypothesis
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
-    options = list(dict.fromkeys(each.hypothesis.option for each in (test, *alike)))
+    options = list(dict.fromkeys(each.hypothesis.option for each in tests))
     shown, more = options[:MOST_OPTIONS], ["another correction"] if len(options) > MOST_OPTIONS else []
     evidence = own.what if is_certain else f"perhaps {own.what}"
     evidence += "; other corrections would explain the recording as well" if len(options) > 1 else ""
