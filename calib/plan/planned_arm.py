@@ -12,6 +12,7 @@ from calib.arm.sweep_section import sweep_section
 from calib.plan.collisions import Geometry
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates
+from calib.plan.types import APPROACH
 from gcomp.arrays import Array, Mask
 
 COLLIDING = (
@@ -46,9 +47,10 @@ class PlannedArm:
     # ---- poses
 
     def sweep_range(self, joint: int) -> tuple[float, float]:
-        """First and last step [rad]; the margin grows with the angle, since the position gain is unknown."""
+        """First and last step [rad], each approached from beyond; the margin grows with the angle, since the position
+        gain is unknown."""
         low, high = float(self.limits.lower[joint]), float(self.limits.upper[joint])
-        margin = self.section.range_margin
+        margin = max(self.section.range_margin, APPROACH)
         return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
 
     @property

@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.sweep_plan import plan_sweep, refuse_unbearable_mass
-from calib.plan.types import SweepPlan
+from calib.plan.types import APPROACH, SweepPlan
 from calib.sweep.step_pass import rough_model
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -133,6 +133,14 @@ def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
 def test_a_range_too_short_to_sweep_names_the_joint() -> None:
     with pytest.raises(BadInput, match=r"j1: of its range .* left to sweep, .* range_margin \(1\.5 rad\)"):
         plan_sweep(with_section(random_arm(7, 3), range_margin=1.5))
+
+
+def test_a_step_is_approached_from_within_the_range_whatever_the_margin() -> None:
+    arm = with_section(random_arm(7, 3), range_margin=1e-3)
+    limits = DriveLimits.of(arm)
+    for sweep in plan_sweep(arm).sweeps:
+        assert limits.lower[sweep.joint] <= sweep.steps[0] - APPROACH
+        assert sweep.steps[-1] + APPROACH <= limits.upper[sweep.joint]
 
 
 def test_one_bias_torque_per_joint() -> None:
