@@ -138,8 +138,9 @@ class Plausibility:
     prior_std: float | Array | Callable[[PreparedSignals, int], float | Array] = np.inf
     """Prior standard deviation of each coefficient, its largest plausible size, of signals and place; infinite for
     none."""
-    background_std: float = 0.0
-    """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
+    background_std: float | Array | Callable[[Shape], float] = 0.0
+    """Standard deviation of each coefficient over sound arms, or what is not known of its law, of a shape; confidence
+    intervals include it."""
     background_nm: bool = False
     """Whether it is a torque, and so smaller on arms of little strength."""
     bounds: Bounds | Callable[[Ratings, Shape], Bounds] = (-np.inf, np.inf)
@@ -198,7 +199,8 @@ class InverseEffect:
 
 
 SHORTEST_DELAY = 1e-3
-"""Shortest time that counts as a delay or a lag [s]."""
+"""Shortest time that counts as a delay or a lag, and by which sound arms have one: between the time of a row and that
+at which a channel in it was set or read [s]."""
 NEAR_ONE = (0.6, 1.6)
 """Bounds of a coefficient whose effect the shape alone determines."""
 CUT_OFF = Plausibility(prior_mean=1.0, prior_std=0.2, bounds=NEAR_ONE)
@@ -225,7 +227,10 @@ def delay_effect(effect_id: str, signature: Signature, start: float, longest: fl
     return InverseEffect(
         effect_id,
         signature,
-        Plausibility(bounds=lambda _ratings, shape: (SHORTEST_DELAY / shape[0], longest / shape[0])),
+        Plausibility(
+            background_std=lambda shape: SHORTEST_DELAY / shape[0],
+            bounds=lambda _ratings, shape: (SHORTEST_DELAY / shape[0], longest / shape[0]),
+        ),
         SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
         parameters_of=lambda c, shape, _: c * shape[0],
     )

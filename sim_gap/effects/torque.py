@@ -4,6 +4,7 @@ They show in `tau` against the model, and negated in motor against `tau`.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -100,16 +101,18 @@ EFFECTS = (
     InverseEffect(  # the width is the deviation after a long way
         "torque.hysteresis",
         _distorted(_stays_behind),
-        Plausibility(bounds=NEAR_ONE),
+        Plausibility(background_std=0.02, bounds=NEAR_ONE),  # by the form that it has
         SearchHints(
             shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
         ),
         parameters_of=lambda c, shape, _: c * shape[0],
     ),
-    InverseEffect(  # the width is what is lost beyond the band
+    InverseEffect(  # the width is what is lost beyond the band, whose edges an offset moves
         "torque.deadband",
         _distorted(lambda torque, shape: -np.clip(torque, -shape[0], shape[0])),
-        CUT_OFF,
+        replace(
+            CUT_OFF, background_std=lambda shape: 0.02 / shape[0], background_nm=True
+        ),  # as an offset moves its edges
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
         parameters_of=lambda c, shape, _: c * shape[0],
     ),

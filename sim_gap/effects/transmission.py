@@ -123,7 +123,7 @@ EFFECTS = (
     InverseEffect(
         "transmission.coupling",
         Signature(_coupling, side="motor", of_motion=True),
-        Plausibility(bounds=(0.0, np.inf)),
+        Plausibility(background_std=np.array([0.0, 0.03, 0.02]), background_nm=True, bounds=(0.0, np.inf)),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=lambda c, shape, _: [shape[1], shape[0], *c],
     ),

@@ -187,7 +187,7 @@ class ResidualSet:
         """A bound in N·m as it applies to an arm of this strength."""
         return torque * min(1.0, float(self.usual_torque.max()) / SMALL_ARM_NM)
 
-    def background(self, torque: float) -> float:
+    def background(self, torque: Array | float) -> Array | float:
         """A standard deviation over sound arms in N·m, as it applies to an arm of this build.
 
         A large arm that gravity hardly loads, its axes being upright, has the friction of a large one.

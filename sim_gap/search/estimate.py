@@ -176,10 +176,11 @@ class EffectEstimate:
         open_links = np.repeat([link not in found for link in range(arm.n)], 3)
         return np.asarray(np.diag(share * np.repeat(usual, 3))[:, open_links])
 
-    def _background(self, term: Term) -> float:
+    def _background(self, term: Term) -> Array | float:
         """Standard deviation of a term's coefficients over sound arms."""
         usual = term.form.plausibility
-        return self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
+        std = usual.background_std(term.shape) if callable(usual.background_std) else usual.background_std
+        return self.store.data.background(std) if usual.background_nm else std
 
     def is_usual(self, term: Term) -> bool:
         """Whether a sound arm may have as much of an effect: every coefficient is within 95 % of theirs."""
