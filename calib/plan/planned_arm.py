@@ -47,8 +47,7 @@ class PlannedArm:
     # ---- poses
 
     def sweep_range(self, joint: int) -> tuple[float, float]:
-        """First and last step [rad], each approached from beyond; the margin grows with the angle, since the position
-        gain is unknown."""
+        """First and last step [rad], with room to approach them, more at large angles as the gain is unknown."""
         low, high = float(self.limits.lower[joint]), float(self.limits.upper[joint])
         margin = max(self.section.range_margin, APPROACH)
         return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
