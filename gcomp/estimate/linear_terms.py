@@ -271,7 +271,7 @@ class LinearTerms:
         gram = np.zeros((len(own), len(own)))
         for c, place in enumerate(self._places):
             if np.all(place[own] >= 0):
-                gram += self.squares[c].sum(0)[np.ix_(place[own], place[own])] / self.floor[c] ** 2
+                gram += self._whole[c][np.ix_(place[own], place[own])] / self.floor[c] ** 2
         spread = 1.0 / np.sqrt(np.maximum(self.prior[own], 1e-300))
         values = np.maximum(np.linalg.eigvalsh(gram * spread * spread[:, None]), 0.0)
         return max(float(np.sum(values / (1.0 + values))), 1.0)
