@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
@@ -159,21 +159,23 @@ def _frictions(estimate: EffectEstimate, data: ResidualSet) -> list[_Friction]:
     known = estimate.predict(data, terms=links)
     out = []
     for s, part in zip(data.signals, data.parts, strict=True):
+        moved = np.array([s.filtered(each) for each in (s.q, s.v, s.a, s.direction)])
         for row in data.rows:
             if row[0] == data.layout.sensor or data.layout.reference(row):
                 continue
             valid = data.valid[row][part]
-            direction = np.rint(s.filtered(s.direction)[valid, row[1]])
-            if len(direction) < FEWEST_MOVING or len({-1.0, 1.0}.intersection(direction)) < 2:
+            direction = moved[3, valid, row[1]]
+            if len(direction) < FEWEST_MOVING or max(direction) < 0.5 or min(direction) > -0.5:
                 continue  # of a joint that goes one way, friction is a constant as any other
             y = (data.values[row] - known[row])[part][valid]
-            out.append(_friction(s, row, y, valid, data.blocks[part][valid]))
+            out.append(_friction(s, row, y, moved[:, valid, row[1]], data.blocks[part][valid]))
     return out
 
 
-def _friction(s: PreparedSignals, row: Row, y: Array, valid: Mask, blocks: NDArray[np.intp]) -> _Friction:
-    """Friction from one recording's residual `y` at its `valid` samples, beside what rigid links may leave."""
-    q, v, a, direction = (s.filtered(each)[valid, row[1]] for each in (s.q, s.v, s.a, s.direction))
+def _friction(s: PreparedSignals, row: Row, y: Array, moved: Array, blocks: NDArray[np.intp]) -> _Friction:
+    """Friction from one recording's residual `y` (k,), beside what rigid links may leave; `moved` are position,
+    velocity, acceleration and direction of the joint, (4, k)."""
+    q, v, a, direction = moved
     x = np.stack([direction, v, np.ones_like(q), np.sin(q), np.cos(q), a], axis=1)
     scale = np.sqrt(np.mean(x**2, axis=0)) + 1e-12
     inverse = np.linalg.pinv((x / scale).T @ (x / scale), rcond=1e-8, hermitian=True)

@@ -13,7 +13,7 @@ from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import BODY, CONSTANT, INERTIA, MASSES, Term
+from sim_gap.search.term import CONSTANT, INERTIA, MASSES, OF_LINKS, Term
 from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
 AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
@@ -80,10 +80,10 @@ class Rivals:
     def _by_one_factor(self, effect: str) -> list[str]:
         """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,
         if they explain as much at the price of one effect: motor torque alone tells their products."""
-        choice, links = self.choice, (MASSES, INERTIA, BODY)
-        if effect not in (*links, CONSTANT) or choice.equations.layout.sensor:
+        choice = self.choice
+        if effect not in (*OF_LINKS, CONSTANT) or choice.equations.layout.sensor:
             return []
-        gone, others = (links, (CONSTANT,)) if effect in links else ((CONSTANT,), (MASSES, INERTIA))
+        gone, others = (OF_LINKS, (CONSTANT,)) if effect in OF_LINKS else ((CONSTANT,), (MASSES, INERTIA))
         rest = [term for term in choice.current if term.effect not in gone or term.bound]
         more = [term for term in choice.effects if term.effect in others and term not in rest]
         score = choice.judge([*rest, *more]) - choice.price(more[1:])

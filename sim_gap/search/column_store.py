@@ -12,6 +12,7 @@ import numpy as np
 
 from gcomp.arm.inertials import move_mass, point_mass
 from gcomp.arrays import Array
+from sim_gap.effects.effect import Side
 from sim_gap.effects.link import mount_matrix, tilt_gravity
 from sim_gap.residuals.layout import ChannelLayout, Columns, Row
 from sim_gap.residuals.preprocess import Found, PreparedSignals
@@ -210,7 +211,7 @@ class ColumnStore:
         layout, parts = self.data.layout, list[Columns]()
         for s, one in zip(self.data.signals, self.about, strict=True):
             plain = {(layout.against_model, j): one.signals.bodies[:, j : j + 1] for j in range(layout.n)}
-            through = self._through(one, Term("link.mass_moment", 0), plain) if self.values else plain
+            through = self._through(one, "link", plain) if self.values else plain
             parts.append({row: s.filtered(x) for row, x in layout.compared(through).items()})
         return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
 
@@ -219,7 +220,7 @@ class ColumnStore:
         total = sum(self.data.lengths)
         parts = [self.columns(term).get(row) for term in terms]
         own = [
-            np.zeros((total, _width(self.columns(t)))) if x is None else x for t, x in zip(terms, parts, strict=True)
+            np.zeros((total, width_of(self.columns(t)))) if x is None else x for t, x in zip(terms, parts, strict=True)
         ]
         beside = [self.offset(term).get(row, np.zeros((total, 1))) for term in terms if term in nonlinear]
         return np.hstack([*own, *beside, np.zeros((total, 0))])
@@ -231,7 +232,7 @@ class ColumnStore:
             return
         found = [self._of(one, term) for one in self.about]
         rows = list(dict.fromkeys(row for own, _ in found for row in own))
-        width = max((_width(own) for own, _ in found), default=0)
+        width = max((width_of(own) for own, _ in found), default=0)
         nonlinear = any(beside for _, beside in found)
         parts: dict[Row, list[Array]] = {row: [] for row in rows}
         for s, (own, beside) in zip(self.data.signals, found, strict=True):
@@ -265,7 +266,7 @@ class ColumnStore:
             plain = signature.slopes(one.signals, layout, term.shape, values)
         else:
             plain = signature.columns(one.entering(term), layout, term.place, term.shape)
-        own = self._through(one, term, plain) if self.values else plain
+        own = self._through(one, signature.side, plain) if self.values else plain
         if values is not None:
             share = one.shares[term]
             beside = {row: share.get(row, 0.0) - own[row] @ values for row in own}
@@ -277,9 +278,9 @@ class ColumnStore:
                 beside = {}
         return layout.compared(own), layout.compared(beside)
 
-    def _through(self, one: EstimateSignals, term: Term, plain: Columns) -> Columns:
+    def _through(self, one: EstimateSignals, side: Side, plain: Columns) -> Columns:
         """Derivatives of the readings: what changes the torque goes through sensor and motor as they are found."""
-        layout, side = self.data.layout, term.form.signature.side
+        layout = self.data.layout
         if side == "motor":
             return {row: x * one.motor_gain[row[1]] for row, x in plain.items()}
         if side == "distortion":
@@ -303,5 +304,5 @@ class ColumnStore:
         return out
 
 
-def _width(columns: Columns) -> int:
+def width_of(columns: Columns) -> int:
     return next(iter(columns.values())).shape[1] if columns else 0

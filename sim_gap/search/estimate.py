@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from gcomp.arrays import Array
-from sim_gap.residuals.layout import Row
+from sim_gap.residuals.layout import Columns, Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.term import Term, shares_a_factor
+from sim_gap.search.column_store import ColumnStore, width_of
+from sim_gap.search.term import MASSES, Term, shares_a_factor
 from sim_gap.search.term_equations import TermEquations
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
@@ -140,23 +140,17 @@ class EffectEstimate:
     def _undetected(self, inverse: Array) -> Array:
         """Contribution to the covariance of undetected errors z of the links' mass moments, (P + S, P + S).
 
-        With torque constants that only motor torque tells, all masses have an error in common, too. The errors shift
-        the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
+        They shift the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
         its usual size and the residual.
         """
         errors = self._errors_of_links()
-        common = self.store.masses_in_common() if shares_a_factor(self.equations.layout, self.terms) else {}
-        size = errors.shape[1] + bool(common)
-        if not size:
+        if not errors:
             return np.zeros_like(inverse)
+        size = sum(width_of(columns) for columns in errors)
         pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
         for (weight, x, residual, _), row in zip(self._jacobian, self.equations.rows, strict=True):
-            z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
-            for link in np.flatnonzero(np.any(errors.reshape(-1, 3, errors.shape[1]), axis=(1, 2))).tolist():
-                if row in (columns := self.store.columns(Term("link.mass_moment", link))):
-                    z[:, : errors.shape[1]] += columns[row][valid] @ errors[3 * link : 3 * link + 3]
-            if row in common:
-                z[:, -1:] = NOMINAL * common[row][valid]
+            valid = self.store.data.valid[row]
+            z = np.hstack([c[row] if row in c else np.zeros((len(valid), width_of(c))) for c in errors])[valid]
             pull += weight * x.T @ z
             own += weight * z.T @ z
             seen += weight * z.T @ residual
@@ -165,16 +159,18 @@ class EffectEstimate:
         mean = spread @ seen
         return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
 
-    def _errors_of_links(self) -> Array:
-        """Changes of all links' mass moments [kg·m] by undetected errors of usual size, (3 n, Z): of each component of
-        each link whose mass moment is not a term."""
+    def _errors_of_links(self) -> list[Columns]:
+        """Changes of the rows by undetected errors of usual size, (K, z) each: of each component of each link's mass
+        moment that is not a term; with torque constants that only motor torque tells, of all masses in common, too."""
         arm = self.store.data.signals[0].arm
-        found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
+        found = {term.place: self.of(term) for term in self.terms if term.effect == MASSES}
         usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), LEAST_LEVER_M * arm.inertial[:, 0])
         wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
         share = min(max(NOMINAL, WORSE * wrong), WORST)
-        open_links = np.repeat([link not in found for link in range(arm.n)], 3)
-        return np.asarray(np.diag(share * np.repeat(usual, 3))[:, open_links])
+        errors = [(share * usual[k], self.store.columns(Term(MASSES, k))) for k in range(arm.n) if k not in found]
+        if shares_a_factor(self.equations.layout, self.terms):
+            errors.append((NOMINAL, self.store.masses_in_common()))
+        return [{row: size * x for row, x in columns.items()} for size, columns in errors if columns]
 
     def _background(self, term: Term) -> Array | float:
         """Standard deviation of a term's coefficients over sound arms."""

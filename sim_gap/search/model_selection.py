@@ -13,7 +13,7 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge
-from sim_gap.search.term import BODY, CONSTANT, INERTIA, MASSES, Term
+from sim_gap.search.term import BODY, CONSTANT, MASSES, OF_LINKS, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
 
@@ -41,8 +41,7 @@ def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     if choice.equations.layout.sensor is not None or chosen.isdisjoint((CONSTANT, MASSES)):
         return []
     drives = [term for term in offered if term.effect == CONSTANT]
-    links = (CONSTANT, MASSES, INERTIA, BODY)
-    return [*drives, *(term for term in choice.current if term.effect not in links)]
+    return [*drives, *(term for term in choice.current if term.effect not in (CONSTANT, *OF_LINKS))]
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:

@@ -74,6 +74,7 @@ class Term:
 
 
 CONSTANT, MASSES, INERTIA, BODY = "actuator.gain", "link.mass_moment", "link.inertia", "link.payload"
+OF_LINKS = MASSES, INERTIA, BODY
 """Recordings of motor torque alone know these only up to a common factor: with links twice as heavy and every torque
 constant twice as large, the drives report the same."""
 

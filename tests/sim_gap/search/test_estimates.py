@@ -93,6 +93,17 @@ def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet)
     assert torque.high - torque.low < 1.5
 
 
+def test_constants_beside_any_mass_moments_are_known_to_an_error_that_all_masses_share() -> None:
+    read = prepare(record(model(), Wrong(), 1, 12.0, 50.0, channels=("tau_motor",)), load_model(model()).arm)
+    data = ResidualSet((read,), layout_of([read]))
+    gains = [Term(GAIN.effect, joint) for joint in range(3)]
+    for links in ((), range(3)):
+        estimate = EffectEstimate(ColumnStore(data), [*gains, *(Term("link.mass_moment", link) for link in links)])
+        (gain,) = estimate.parameters(next(term for term in estimate.terms if term.effect == GAIN.effect)).values()
+        assert gain.low < 1.0 < gain.high
+        assert gain.high - gain.low > 2 * 0.015
+
+
 def test_what_is_not_there_may_be_nothing_by_its_interval(data: ResidualSet) -> None:
     terms = [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,)), GAIN]
     estimate = EffectEstimate(ColumnStore(data), terms)
