@@ -101,7 +101,7 @@ EFFECTS = (
     InverseEffect(  # the width is the deviation after a long way
         "torque.hysteresis",
         _distorted(_stays_behind),
-        Plausibility(background_std=0.02, bounds=NEAR_ONE),  # by the form that it has
+        Plausibility(background_std=0.02, bounds=NEAR_ONE),  # what is not known of its form
         SearchHints(
             shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
         ),
@@ -110,9 +110,7 @@ EFFECTS = (
     InverseEffect(  # the width is what is lost beyond the band, whose edges an offset moves
         "torque.deadband",
         _distorted(lambda torque, shape: -np.clip(torque, -shape[0], shape[0])),
-        replace(
-            CUT_OFF, background_std=lambda shape: 0.02 / shape[0], background_nm=True
-        ),  # as an offset moves its edges
+        replace(CUT_OFF, background_std=lambda shape: 0.02 / shape[0], background_nm=True),
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
         parameters_of=lambda c, shape, _: c * shape[0],
     ),
