@@ -12,8 +12,7 @@ from typing import TypeAlias, TypeGuard, TypeVar
 
 from armlink.arm_file import SIMULATED, ArmFile, Bus, load_arm
 from armlink.errors import BadInput
-from armlink.loop.driver import ArmDriver
-from armlink.loop.open import open_arm
+from armlink.loop.open import ArmDriver, open_arm
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm

@@ -17,7 +17,7 @@ from armlink.content.atomic_file import open_whole, writing
 from armlink.errors import BadInput
 from armlink.extras import require_extra
 from armlink.link.types import Setpoints
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from armlink.recording.csv_text import load_columns, write_numbers
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.trajectory import WorkMotion, trajectory, way_and_rest

@@ -24,6 +24,22 @@ class DriveSerial:
     """It is simulated in this process, and ends with it."""
 
 
+class Controllers(Protocol):
+    """Access to the calibration of every joint, in its controller or in the host."""
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """Serial number of the drive of joint 0 … n−1; raises BusFault."""
+
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Stage, read back and make active in joint 0 … n−1 (`store`: in flash too); returns what is active.
+
+        Raises BadInput, BusFault.
+        """
+
+
 @dataclass(eq=False)
 class Command:
     """One cycle's command for n joints; each joint uses the field that its mode needs, the other may be NaN."""

@@ -8,8 +8,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from armlink.channel import Closed, start_process
 from armlink.link.ends import EndCause
-from armlink.link.types import Tell
-from armlink.loop.driver import Controllers
+from armlink.link.types import Controllers, Tell
 from armlink.loop.ending import HANG_SECONDS, see_out
 from armlink.loop.messages import Call, LoopAnswer, Open
 

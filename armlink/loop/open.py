@@ -3,11 +3,13 @@
 from armlink.arm_file import ArmFile
 from armlink.bus.open import resolve_bus
 from armlink.link.link import Link
-from armlink.loop.driver import ArmDriver
 from armlink.loop.remote_link import RemoteLink
 
 IN_PROCESS = ("armlink_sim", "virtual")
 """Interfaces of python-can whose bus another process cannot open."""
+ArmDriver = Link | RemoteLink
+"""Drives the joints of one arm. A Link makes each cycle when it is asked for the next sample. The process of a
+RemoteLink keeps the cycle whatever the job is doing: the last command stays in force until the next one comes."""
 
 
 def is_in_process(arm: ArmFile, bus: str | None = None) -> bool:

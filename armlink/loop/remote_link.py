@@ -14,10 +14,10 @@ from armlink.arm_file import ArmFile
 from armlink.channel import Closed
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause, cause_of
+from armlink.link.link import Link
 from armlink.link.park import park
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers, remote
-from armlink.loop.driver import ArmDriver
 from armlink.loop.ending import TOLD_EVERY
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
@@ -32,7 +32,7 @@ SAMPLE = 5.0
 
 
 class RemoteLink(CycleProcess, RemoteControllers):
-    """An `ArmDriver`; context manager like `Link`. Not for several threads."""
+    """For a job as `Link`, which documents what is not documented here. Not for several threads."""
 
     def __init__(self, arm: ArmFile, bus: str | None = None) -> None:
         """Start the process and open the bus; raises BadInput, BusFault."""
@@ -45,7 +45,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self._answers: dict[int, LoopAnswer] = {}
         self._in_force: Command | None = None
         self.torque_sent = self.position_sent = np.full(self.n, np.nan)
-        """As ArmDriver has them, but of the newest sample taken."""
+        """As Link has them, but of the newest sample taken."""
         self.position_step = np.full(self.n, np.inf)
         self._told = self._heard = time.monotonic()
         self._tell_on: Tell = lambda text: None
@@ -74,10 +74,10 @@ class RemoteLink(CycleProcess, RemoteControllers):
         found: tuple[str, ...] = self._call("uncalibrated")
         return found
 
-    scan = remote(ArmDriver.scan)
-    disable = remote(ArmDriver.disable)
-    stop = remote(ArmDriver.stop)
-    read_temperatures = remote(ArmDriver.read_temperatures)
+    scan = remote(Link.scan)
+    disable = remote(Link.disable)
+    stop = remote(Link.stop)
+    read_temperatures = remote(Link.read_temperatures)
 
     def start(self) -> None:
         self._call("start")
@@ -101,6 +101,8 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self.inside(park, lambda text: None)
 
     def inside(self, function: Callable[..., Any], tell: Tell, *args: Any, **kw: Any) -> Any:
+        """As Link.inside. Function, arguments and answer must be picklable; if this process ends, the function's call
+        of `tell` raises."""
         self._tell_on = tell
         try:
             return self._call(function, *args, **kw)

@@ -12,8 +12,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar
 
 from armlink.errors import ArmlinkError
-from armlink.link.types import Controller
-from armlink.loop.driver import Controllers
+from armlink.link.types import Controller, Controllers
 
 T = TypeVar("T")
 CLOSING_SECONDS = 2.0

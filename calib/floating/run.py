@@ -16,7 +16,7 @@ from armlink.arm_file import ArmFile
 from armlink.drives.orders import Mode
 from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm

@@ -7,8 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from armlink.loop.driver import ArmDriver
-from armlink.loop.open import open_arm
+from armlink.loop.open import ArmDriver, open_arm
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback, check_held_out

@@ -10,7 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Calibration
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled

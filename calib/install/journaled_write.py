@@ -18,8 +18,7 @@ from typing import Any
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BusFault, Refused
-from armlink.link.types import Calibration, DriveSerial
-from armlink.loop.driver import Controllers
+from armlink.link.types import Calibration, Controllers, DriveSerial
 from calib.install.plausibility import Admitted
 from calib.records.bounds import require_sound
 from calib.records.records import CalibrationRecord

@@ -12,7 +12,7 @@ from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
 from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.types import Command, Sample, Samples, Setpoints
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck

@@ -11,8 +11,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.types import Calibration
-from armlink.loop.driver import Controllers
+from armlink.link.types import Calibration, Controllers
 from armlink.torque_calibration import TorqueCalibration, same_real32
 from calib.arm.kinematics import gcomp_arm
 from calib.install.check_motion import WORSE

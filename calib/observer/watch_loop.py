@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from armlink.errors import Refused
 from armlink.link.types import Command, Sample
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.observer.decision import Event
 from calib.observer.observer import AnyObserver
 from calib.observer.recalibrator import Recalibration, Recalibrator

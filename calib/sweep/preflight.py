@@ -13,7 +13,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.types import Stats
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled

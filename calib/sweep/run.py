@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.dataset import DataWriter, Manifest, SweepData, load_data

@@ -12,7 +12,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import HostLate, Stall
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from calib.dataset import DataWriter, PlanLine, StallLine, SweepData
 from calib.motion.mover import Mover
 from calib.plan.types import Sweep, SweepPlan

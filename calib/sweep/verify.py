@@ -16,7 +16,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.link.guard import ReadingBounds
 from armlink.link.types import Sample
-from armlink.loop.driver import ArmDriver
+from armlink.loop.open import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_motion, sweep_section
