@@ -118,7 +118,7 @@ def has_our_topics(path: Path) -> bool:
     """Whether a file's joint states are where this module looks, or cannot be told because it is cut."""
     try:
         with path.open("rb") as stream:
-            summary = SeekingReader(stream, record_size_limit=most_record(path)).get_summary()
+            summary = SeekingReader(stream, record_size_limit=_most_record(path)).get_summary()
     except DAMAGED:
         return True
     if summary is None or not summary.channels:
@@ -169,23 +169,19 @@ def _read(path: Path) -> tuple[dict[str, list[JointMessage]], str]:
 
 def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
     """Records of the file; raises BadInput where a chunk unpacks to more than a recording may hold."""
-    most = most_record(path)
+    most = _most_record(path)
     for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=most).records:
         if isinstance(record, Chunk):
-            require_chunk_size(record, path)
+            if record.uncompressed_size > MOST_CHUNK:
+                size, most_size = record.uncompressed_size / 1e6, MOST_CHUNK / 1e6
+                what = f"a chunk unpacks to {size:.0f} MB, expected at most {most_size:.0f} MB"
+                raise BadInput(f"{path}: {what}: the file is damaged, or has to be written with smaller chunks")
             yield from breakup_chunk(_unpacked(record), validate_crc=True)
         else:
             yield record
 
 
-def require_chunk_size(chunk: Chunk, path: Path) -> None:
-    """Raise BadInput where a chunk states that it unpacks to more than a recording may hold."""
-    if chunk.uncompressed_size > MOST_CHUNK:
-        size = f"a chunk unpacks to {chunk.uncompressed_size / 1e6:.0f} MB, expected at most {MOST_CHUNK / 1e6:.0f} MB"
-        raise BadInput(f"{path}: {size}: the file is damaged, or has to be written with smaller chunks")
-
-
-def most_record(path: Path) -> int:
+def _most_record(path: Path) -> int:
     """Bytes that a record may have: what is stated beyond the file's own size is damage."""
     return min(path.stat().st_size, MOST_BYTES)
 

@@ -14,15 +14,18 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from zstandard import ZstdDecompressor, ZstdError
 
+from armlink.content.file_content import parse_yaml, read_whole
 from armlink.errors import ArmlinkError, BadInput
-from armlink.recording.bag_sizes import require_bag_sizes
 from armlink.recording.joint_messages import STATES, TOPICS, JointMessage, left_out, main_joints, recording_of_messages
-from armlink.recording.recording import Recording, require_size
+from armlink.recording.recording import PIECE, Recording, require_size
 from armlink.recording.ros_joint_state import NANO
 
 BESIDES = TOPICS.keys() - {STATES}
 """Topics beside the states."""
+MOST_WINDOW = 1 << 27
+"""Window of zstd [bytes]: what its own command allows without `--long`."""
 
 
 def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
@@ -36,7 +39,7 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
     files = [path] if isinstance(path, Path) else list(path)
     path = files[0] if len(files) == 1 else files[0].parent
     for each in files:
-        require_bag_sizes(each)
+        _require_room(each)
     try:
         with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
@@ -61,6 +64,26 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
     main = [by_stamp[stamp] for stamp in sorted(by_stamp)]
     others = [[_besides(topic, each) for each in messages] for topic, messages in samples.items()]
     return recording_of_messages(main, others, names, str(path), left_out(alone))
+
+
+def _require_room(path: Path) -> None:
+    """Raise BadInput where rosbags would fill the disk with the packed files of a bag, or its description is too large.
+
+    What else a bag unpacks to stays in memory, which has a budget.
+    """
+    description = path / "metadata.yaml"
+    if description.is_file():
+        parse_yaml(read_whole(description), description)
+    for each in path.glob("*.zstd"):
+        size = 0
+        try:
+            unpacker = ZstdDecompressor(max_window_size=MOST_WINDOW)
+            with each.open("rb") as packed, unpacker.stream_reader(packed, read_across_frames=True) as stream:
+                while piece := stream.read(PIECE):
+                    size += len(piece)
+                    require_size(size, str(each))
+        except (ZstdError, OSError) as error:
+            raise BadInput(f"{each}: cannot be unpacked: {error}") from None
 
 
 def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterable[Any], path: Path) -> list[Any]:
