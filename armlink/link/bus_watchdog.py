@@ -31,40 +31,32 @@ class BusWatch:
         """`sends`: how often a drive sends in a cycle at most; more than once where its own clock is faster."""
         self._crowd = CROWD_PER_JOINT * joints * sends + CROWD
         self._doubled: set[int] = set()
+        self.others: dict[int, int] = {}
+        """Frames of this cycle that were no readings of the fast way, by identifier."""
+        self.strangers = 0
+        """Frames of this cycle that no drive of ours sends."""
+        self.readings = [0] * joints
+        self.clear()
+
+    def clear(self) -> None:
+        joints = len(self.readings)
+        self.syncs, self.readings[:] = 0, [0] * joints
+        self.intruder = ""
+        """Description of a frame received that only the host may send; empty if there was none."""
+        self.reception = ""
+        """Why the interface receives nothing, in words; empty while it does."""
+        self.flooded = False
         self._double_cycles = [0] * joints
         self._slow_readings = [0] * joints
         self._torques_more = [0.0] * joints
         """Torques that came alone, less positions, of late; none less than 0."""
         self._positions_before = [0] * joints
         """Positions when the newest torque alone came."""
-        self._beyond = 0.0
-        """Frames beyond the limit, in cycles' worth of it; it falls as cycles bring less than that."""
-        self.others: dict[int, int] = {}
-        """Frames of this cycle that were no readings of the fast way, by identifier."""
-        self.strangers = 0
-        """Frames of this cycle that no drive of ours sends."""
-        self.syncs = 0
-        self.readings = [0] * joints
-        self.restarted: set[int] = set()
-        """Joints whose controller has sent its boot-up message."""
-        self.clear()
-
-    def clear(self) -> None:
-        self.restarted.clear()
-        self.syncs, self.readings[:] = 0, [0] * len(self.readings)
-        self.intruder = ""
-        """Description of a frame received that only the host may send; empty if there was none."""
-        self.reception = ""
-        """Why the interface receives nothing, in words; empty while it does."""
-        self.flooded = False
-        self._double_cycles = [0] * len(self._double_cycles)
-        self._slow_readings = [0] * len(self.readings)
-        self._torques_more = [0.0] * len(self.readings)
-        self._positions_before = [0] * len(self.readings)
         self.forged: int | None = None
         """The joint in whose name a second node sends torques, velocities or states; None: no joint."""
         self._beyond = 0.0
-        self._counted = [0] * len(self.readings)
+        """Frames beyond the limit, in cycles' worth of it; it falls as cycles bring less than that."""
+        self._counted = [0] * joints
         self._culprit: str | int = ""
         self.crowding = 0.0
         """Frames a cycle that no drive of ours sends, a mean over CROWDED_CYCLES."""

@@ -254,7 +254,7 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return self._readings.fill(board, places)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """The cyclic frames of a link take the way of `fill`; emergencies, heartbeats and SDO come here."""
+        """Emergencies, heartbeats and SDO; the cyclic frames take the way of `fill`."""
         joint, service = self._joint_of.get(can_id & 0x7F), can_id & ~0x7F
         if joint is None:
             return None
@@ -264,13 +264,8 @@ class CanopenDrives(BasicDrives[DriveMemory]):
             self.known.node_states[joint] = state = data[0] & 0x7F if data else 0
             if state == 0:
                 self.known.restarted.add(joint)
-        elif service == objects.SDO_RESPONSE_ID:
-            if self._network is not None:
-                self._network.notify(can_id, bytearray(data), 0.0)
-        elif service == TPDO1.cob_base:
-            return self._readings.reading(joint, data)
-        elif service == TPDO2.cob_base and (slow := self._readings.slow(joint, data)) is not None:
-            return slow._replace(power=self.power(joint))
+        elif service == objects.SDO_RESPONSE_ID and self._network is not None:
+            self._network.notify(can_id, bytearray(data), 0.0)
         return None
 
     def details(self, joint: int, sends: bool) -> Mapping[str, Any]:

@@ -14,7 +14,7 @@ from armlink.errors import BadInput, BusFault
 TORQUE_PER_MICRO = 1e-6
 """2100h:01 is in µN·m."""
 RATED_TORQUE_TOLERANCE = 1e-3
-INCREMENTS, REVOLUTIONS, RADIANS, DEGREES = 0xB5, 0xB4, 0x10, 0x41
+REVOLUTIONS, RADIANS, DEGREES = 0xB4, 0x10, 0x41
 """Units in 60A8h and 60A9h (CiA 303-2): bits 16 to 23; of a velocity bits 8 to 15 are the time; a power of ten is in
 bits 24 to 31 of both."""
 SECOND, MINUTE = 0x03, 0x47

@@ -89,23 +89,8 @@ class ReadingFrames:
             evidence = {"code": code, "register": register}
             self._board.events.append(DriveEvent(self._places[joint], f"{code:04X}h", emcy.name_of(code), evidence))
 
-    def reading(self, joint: int, data: bytes) -> Reading | None:
-        """TPDO1: position and torque; None where the bytes are too few or too many."""
-        size, unpack, unit, scale, zero = self._rows[joint]
-        if len(data) != size:
-            return None
-        values = unpack(data)
-        return Reading(joint, values[0] * unit, sensor_torque=(values[1] - zero) * scale if scale else math.nan)
-
-    def slow(self, joint: int, data: bytes) -> Reading | None:
-        """TPDO2: status word, motor torque, velocity; None where the bytes are too few or too many."""
-        slow = self._slow(joint, data)
-        if slow is None:
-            return None
-        self._known.statuses[joint] = slow[0]
-        return Reading(joint, velocity=slow[2], motor_torque=slow[1])
-
     def _slow(self, joint: int, data: bytes) -> tuple[int, float, float] | None:
+        """Status word, motor torque and velocity of TPDO2; None where the bytes are too few or too many."""
         wire = self._wires[joint]
         layout, unit = wire.layouts[TPDO2.name], wire.unit
         if len(data) != layout.size:
