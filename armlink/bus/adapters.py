@@ -1,7 +1,6 @@
 """Adapters of python-can's buses: SocketCAN and udp_multicast through their sockets, others through messages."""
 
 import logging
-from types import TracebackType
 from typing import TYPE_CHECKING, Self, cast
 
 import can
@@ -31,7 +30,7 @@ class PythonCanBus:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.shutdown()
 
     @property

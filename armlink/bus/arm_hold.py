@@ -11,7 +11,6 @@ import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from armlink.bus.bus_group import BusGroup
@@ -78,7 +77,7 @@ class ArmHold:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.release()
 
 

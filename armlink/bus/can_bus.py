@@ -34,23 +34,11 @@ class CanBus(Protocol):
     def shutdown(self) -> None: ...
 
 
-class MessageSource(Protocol):
-    """A bus that gives access to all messages, extended, remote and error frames too, with their timestamps."""
-
-    @property
-    def channel_info(self) -> str: ...
-
-    @property
-    def clock(self) -> Clock | None:
-        """The bus's own time, as of CanBus."""
+class MessageBus(CanBus, Protocol):
+    """It also gives access to all messages, extended, remote and error frames too, with their timestamps."""
 
     def recv(self, timeout: float | None = None) -> "can.Message | None":
         """The next message, or None after `timeout` seconds (None: wait without limit)."""
-
-    def shutdown(self) -> None: ...
-
-
-class MessageBus(CanBus, MessageSource, Protocol): ...
 
 
 @runtime_checkable

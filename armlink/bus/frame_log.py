@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Callable, Generator, Iterator
 from datetime import datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import can
@@ -100,7 +99,7 @@ class FrameLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._writer.stop()
 
     def write(self, message: can.Message, stamp: int) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import can
 
-from armlink.bus.can_bus import MessageSource
+from armlink.bus.can_bus import MessageBus
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import as_frame, is_data, receive_message
 from armlink.bus.port import Frame, Port
@@ -17,7 +17,7 @@ class TappedBus(InProcessBus):
 
     ended = False
 
-    def __init__(self, source: MessageSource, tap: Callable[[can.Message, int], None]) -> None:
+    def __init__(self, source: MessageBus, tap: Callable[[can.Message, int], None]) -> None:
         """Take ownership of `source`; `tap` gets each message and its timestamp by the interface [µs]."""
         self._source, self._tap = source, tap
         self.clock, self.channel_info = source.clock, source.channel_info

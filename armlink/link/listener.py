@@ -9,7 +9,6 @@ The one exception is asked for by name: `write_calibration` and `read_calibratio
 
 from collections import deque
 from collections.abc import Callable
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from armlink.arm_file import ArmFile, LinkJoint
@@ -114,7 +113,7 @@ class Listener(HeardArm, Calibrations):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.bus.shutdown()
 
     @property
