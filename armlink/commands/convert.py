@@ -24,6 +24,7 @@ def convert(
     """
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
+    from armlink.content.atomic_file import writing
     from armlink.errors import BadInput
     from armlink.recording.files import keeps_names, load_recording, save_recording
     from armlink.recording.recording import default_names
@@ -34,10 +35,8 @@ def convert(
             "without this option, and give the option to the diagnosis"
         )
     recording = load_recording(source, stated)
-    try:
+    with writing(target):
         save_recording(recording, target)
-    except OSError as error:
-        raise BadInput(f"{target}: cannot be written: {error.strerror}") from None
     if recording.warning:
         PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
     rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])

@@ -43,13 +43,14 @@ def record(
     from armlink.commands.options import stated_bus
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
+    from armlink.content.atomic_file import writing
     from armlink.errors import BadInput, BusFault
     from armlink.extras import require_extra
     from armlink.recording.files import SUFFIXES
     from armlink.recording.recorder import Recorder
 
     arm_file = load_arm(arm)
-    if out is None and frames is None:
+    if (file := out or frames) is None:
         raise BadInput("record: nothing to write: give a .mcap file, or `--frames` with a .asc, .blf or .log file")
     if out is not None and out.suffix != SUFFIX:
         first = out.with_suffix(SUFFIX)
@@ -64,15 +65,12 @@ def record(
         opened = open_link_bus(stated_bus(bus, ros2, lerobot), arm_file.require_link())
         stack.callback(opened.shutdown)
         recorder = Recorder(arm_file, TappedBus(opened, log.write) if log else opened)
-        try:
-            with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as files:
-                writer = files.enter_context(RecordingWriter(out, recorder.names)) if out else None
-                for t, channels in recorder.rows(seconds or float("inf")):
-                    if writer:
-                        writer.append(t, channels)
-                    rows, last = rows + 1, t
-        except OSError as error:
-            raise BadInput(f"{out or frames}: cannot be written: {error.strerror}") from None
+        with writing(file), contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as files:
+            writer = files.enter_context(RecordingWriter(out, recorder.names)) if out else None
+            for t, channels in recorder.rows(seconds or float("inf")):
+                if writer:
+                    writer.append(t, channels)
+                rows, last = rows + 1, t
     if not rows:
         if out:
             out.unlink(missing_ok=True)

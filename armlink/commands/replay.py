@@ -38,6 +38,7 @@ def replay(
     from armlink.bus.frame_log import is_log
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
+    from armlink.content.atomic_file import writing
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording, save_recording
     from armlink.recording.replay import play_onto, recording_of_log, show
@@ -53,10 +54,8 @@ def replay(
         sent = play_onto(arm_file, source, recording, bus, speed)
         out.print(f"{source}: {sent} frames sent to {bus}")
     elif target is not None:
-        try:
+        with writing(target):
             save_recording(recording, target)
-        except OSError as error:
-            raise BadInput(f"{target}: cannot be written: {error.strerror}") from None
         out.print(f"{target}: {recording.t.size} rows")
     else:
         show(recording, out, speed)

@@ -169,7 +169,10 @@ class BasicDrives(Generic[M]):
     def positions(self, ask: Ask) -> list[float]:
         """Where every drive stands without being set up [rad]; NaN of one that does not answer, whose scale is not
         known, or that does not tell. Sets nothing."""
-        return [math.nan] * self.m
+        return [self.position(joint, ask) for joint in range(self.m)]
+
+    def position(self, joint: int, ask: Ask) -> float:
+        return math.nan
 
     def fits(self, limits: Sequence[Limits]) -> None:
         """Raise BadInput where files that the arm file names, or limits, can fit no drive; asks no drive."""

@@ -113,12 +113,14 @@ class Checks:
     def judge(self, joint: str, check: str, passed: bool, found: str, seconds: float | None = None) -> None:
         self.add(joint, check, "passed" if passed else "failed", found, seconds)
 
-    def attempt(self, joint: str, check: str, work: Callable[[], str]) -> None:
-        """Add what `work` found, or what it raised."""
+    def attempt(self, joint: str, check: str, work: Callable[[], str]) -> bool:
+        """Add what `work` found, or what it raised; whether it passed."""
         try:
             self.add(joint, check, "passed", work())
         except ArmlinkError as error:
             self.add(joint, check, "failed", str(error))
+            return False
+        return True
 
     @property
     def failed(self) -> list[Result]:

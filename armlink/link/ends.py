@@ -6,11 +6,10 @@ last: the arm is held, then parked in `link.park`, or let down along its own loa
 
 from contextlib import suppress
 from enum import Enum
-from typing import Protocol
 
 from armlink.errors import BusFault, Refused, Stall
 from armlink.link.cycle import ENABLE_SECONDS
-from armlink.link.park import Parked, cycles, let_down, park
+from armlink.link.park import StowableArm, cycles, let_down, park
 from armlink.link.types import Tell
 from armlink.termination import Dropped
 
@@ -53,20 +52,6 @@ ENDS: dict[EndCause, tuple[Response, Response]] = {
 `armlink.loop.process`, which makes the cycles."""
 
 
-class Ended(Parked, Protocol):
-    @property
-    def held(self) -> bool:
-        """Whether the joints are held by the host alone."""
-
-    @property
-    def falls(self) -> bool:
-        """Whether some drive lets go when its host falls silent."""
-
-    def stop(self) -> None: ...
-
-    def let_go(self) -> None: ...
-
-
 def cause_of(error: BaseException | None) -> EndCause:
     """Why the work ends, by the exception that left it."""
     match error:
@@ -83,7 +68,7 @@ def cause_of(error: BaseException | None) -> EndCause:
     return EndCause.FAILED
 
 
-def end(link: Ended, cause: EndCause, tell: Tell) -> None:
+def end(link: StowableArm, cause: EndCause, tell: Tell) -> None:
     """Bring an arm to its end; raises nothing. `tell` may raise Dropped: the arm is then let go at once."""
     if not (link.enabled or link.held):
         return
@@ -103,7 +88,7 @@ def end(link: Ended, cause: EndCause, tell: Tell) -> None:
             tell(f"the arm could not be parked ({fault}): the drives switch their power off, so the arm may fall")
 
 
-def _stow(link: Ended, tell: Tell) -> None:
+def _stow(link: StowableArm, tell: Tell) -> None:
     """Park or let down, and take the power."""
     try:
         why = _not_parked(link, tell)
@@ -116,7 +101,7 @@ def _stow(link: Ended, tell: Tell) -> None:
         let_down(link, tell, why)
 
 
-def _not_parked(link: Ended, tell: Tell) -> str:
+def _not_parked(link: StowableArm, tell: Tell) -> str:
     """Park; why that is not possible, empty where it was."""
     if link.section.park is None:
         return "the arm file has no link.park"
@@ -131,7 +116,7 @@ def _not_parked(link: Ended, tell: Tell) -> str:
     return why
 
 
-def _catch(link: Ended) -> None:
+def _catch(link: StowableArm) -> None:
     """Hold the joints, those included that were let go: within what a walk to power takes at most, or not at all."""
     for _ in range(cycles(link, ENABLE_SECONDS)):
         link.keep()

@@ -34,7 +34,7 @@ LONGEST_LOWERING = 60.0
 """The power goes then, whether the arm rests or not [s]: half a turn at LOWERING_SPEED takes half of it."""
 
 
-class Parked(Protocol):
+class StowableArm(Protocol):
     arm: ArmFile
     section: LinkSection
     names: tuple[str, ...]
@@ -47,22 +47,34 @@ class Parked(Protocol):
     def enabled(self) -> bool: ...
 
     @property
+    def held(self) -> bool:
+        """Whether the joints are held by the host alone."""
+
+    @property
+    def falls(self) -> bool:
+        """Whether some drive lets go when its host falls silent."""
+
+    @property
     def latest_position(self) -> Array:
         """Newest position readings (n,) [rad]."""
 
     def keep(self, goal: Array | None = None) -> Sample:
         """One cycle that holds every joint that can be held, or leads it towards `goal` (n,) [rad]."""
 
+    def stop(self) -> None: ...
+
+    def let_go(self) -> None: ...
+
     def disable(self) -> None: ...
 
 
-def falling(link: Parked) -> list[str]:
+def falling(link: StowableArm) -> list[str]:
     """Joints whose drives do not hold on their own when their host falls silent."""
     traits = traits_of(link.groups)
     return [name for name, each in zip(link.names, traits, strict=True) if each.silence != "holds"]
 
 
-def require_deadman(link: Parked) -> None:
+def require_deadman(link: StowableArm) -> None:
     """Raise Refused where a drive keeps its last command when its host dies, and no keeper stops it."""
     traits = traits_of(link.groups)
     for name, each in zip(link.names, traits, strict=True):
@@ -75,7 +87,7 @@ def require_deadman(link: Parked) -> None:
             )
 
 
-def park(link: Parked, tell: Tell) -> None:
+def park(link: StowableArm, tell: Tell) -> None:
     """Move the arm to `link.park`, let it rest there, and take the power from every joint.
 
     The joints move together on a straight line in joint space, which must be clear; one that cannot be held is left
@@ -109,7 +121,7 @@ def park(link: Parked, tell: Tell) -> None:
     tell("the arm is in its parking pose, and its power is off")
 
 
-def _power_off(link: Parked) -> None:
+def _power_off(link: StowableArm) -> None:
     """Take the power; a joint that could not be held need not tell that it is off."""
     lost = not all(link.commander.held)
     try:
@@ -119,7 +131,7 @@ def _power_off(link: Parked) -> None:
             raise
 
 
-def _require_following(link: Parked, target: Array, most: float, how: str) -> None:
+def _require_following(link: StowableArm, target: Array, most: float, how: str) -> None:
     """Raise Refused, the joints holding, where one that is held is further than `most` [rad] from its target."""
     here = link.latest_position
     off = np.where(link.commander.held, np.abs(here - target), 0.0)
@@ -132,7 +144,7 @@ def _require_following(link: Parked, target: Array, most: float, how: str) -> No
         )
 
 
-def let_down(link: Parked, tell: Tell, why: str) -> None:
+def let_down(link: StowableArm, tell: Tell, why: str) -> None:
     """Lower the arm as its own load pulls it, slowly, until it rests; then take the power.
 
     Each joint moves against the torque that its drive makes to hold it: downhill, whatever the arm carries, and away
@@ -175,12 +187,12 @@ def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
     return start + way[:, None] * (goal - start)
 
 
-def speeds(link: Parked, speed: float) -> Array:
+def speeds(link: StowableArm, speed: float) -> Array:
     """The speed of a way to park, no joint beyond what it may turn at (n,) [rad/s]."""
     fastest: Array = np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
     return fastest
 
 
-def cycles(link: Parked, seconds: float) -> int:
+def cycles(link: StowableArm, seconds: float) -> int:
     """Cycles in so many seconds, at least one."""
     return max(1, round(seconds / link.period))

@@ -6,7 +6,7 @@ A cycle begins with SYNC, of drives without SYNC with the command to the first o
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -105,9 +105,6 @@ class CycleStats:
             load=self._whole / (self._bitrate * elapsed) if elapsed > 0 else math.nan,
             bus_ms_per_cycle=self._whole / self._bitrate * 1e3 / self._cycles if self._cycles else math.nan,
         )
-
-    def as_json(self) -> dict[str, object]:
-        return asdict(self.report())
 
 
 def _histogram(latencies: Array) -> tuple[tuple[float, int], ...]:

@@ -146,17 +146,13 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         power = _POWERS.get(told.state, Power.UNKNOWN)
         return DriveIdentity(joint, self.settings[joint].address, True, told.name, serial, power=power)
 
-    def positions(self, ask: Ask) -> list[float]:
-        found = []
-        for services, row in zip(self.services(ask), self.rows, strict=True):
-            try:
-                known = services.present()
-                found.append(
-                    services.read(objects.POSITION) * read_units(services, row).position if known else math.nan
-                )
-            except ArmlinkError:  # told, with its reason, by who checks the units
-                found.append(math.nan)
-        return found
+    def position(self, joint: int, ask: Ask) -> float:
+        services = self.services(ask)[joint]
+        try:
+            unit = read_units(services, self.rows[joint]).position if services.present() else math.nan
+            return float(services.read(objects.POSITION) * unit) if unit == unit else math.nan
+        except ArmlinkError:  # told, with its reason, by who checks the units
+            return math.nan
 
     # ---- set-up
 

@@ -52,16 +52,6 @@ ENABLED = int(DamiaoStatus.ENABLED)
 POWERS: dict[int | None, Power] = {DamiaoStatus.DISABLED: Power.OFF, DamiaoStatus.LOST_COMMUNICATION: Power.STOPPED}
 NO_FAULTS = frozenset((int(DamiaoStatus.DISABLED), int(DamiaoStatus.ENABLED), int(DamiaoStatus.LOST_COMMUNICATION)))
 UNKNOWN_RANGES = Ranges(math.nan, math.nan, math.nan)
-FAULTS = {
-    DamiaoStatus.OVERVOLTAGE: "overvoltage",
-    DamiaoStatus.UNDERVOLTAGE: "undervoltage",
-    DamiaoStatus.OVERCURRENT: "overcurrent",
-    DamiaoStatus.MOSFET_HOT: "power stage too hot",
-    DamiaoStatus.ROTOR_HOT: "motor too hot",
-    DamiaoStatus.OVERLOAD: "overload",
-}
-
-
 LABEL = re.compile(r"DM-?(?P<kind>[JHG]?)(?P<size>\d{4,5})(?P<variant>[A-Z]?)(-?2EC)?([ _-]?(24|48)V)?([ _-]?V[\d.]+)?")
 """A label, such as DM-J4340P-2EC V1.1."""
 
@@ -207,11 +197,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         wrong = "" if reply == own else f"replies on {reply:02X}h, but the arm file has {own:02X}h"
         return self.present(joint, "Damiao DM-J", f"{serial:08X}", f"{software} (hardware {hardware})", wrong)
 
-    def positions(self, ask: Ask) -> list[float]:
-        """By the scales that each drive has at present."""
-        return [self._position(ask, joint) for joint in range(self.m)]
-
-    def _position(self, ask: Ask, joint: int) -> float:
+    def position(self, joint: int, ask: Ask) -> float:
+        """By the scales that it has at present."""
         values = self._read(ask, joint, RANGE_FIELDS)
         if values is None:
             return math.nan
@@ -340,8 +327,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
 def _fault_text(state: int) -> str:
     if state in NO_FAULTS:
         return ""
-    words = FAULTS[DamiaoStatus(state)] if state in FAULTS else "unknown state"
-    return f"{words} (state {state:X}h)"
+    name = next((each.name for each in DamiaoStatus if each == state), "unknown state")
+    return f"{name.lower().replace('_', ' ')} (state {state:X}h)"
 
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:

@@ -73,8 +73,8 @@ class DamiaoStatus(IntEnum):
     OVERVOLTAGE = 0x8
     UNDERVOLTAGE = 0x9
     OVERCURRENT = 0xA
-    MOSFET_HOT = 0xB
-    ROTOR_HOT = 0xC
+    POWER_STAGE_TOO_HOT = 0xB
+    MOTOR_TOO_HOT = 0xC
     LOST_COMMUNICATION = 0xD
     OVERLOAD = 0xE
 

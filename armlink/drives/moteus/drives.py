@@ -140,14 +140,11 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         text = "".join(f"{part & 0xFFFFFFFF:08X}" for part in reversed(serial))
         return self.present(joint, f"moteus model {model}", text, f"{firmware >> 8 & 0xFF}.{firmware & 0xFF}")
 
-    def positions(self, ask: Ask) -> list[float]:
-        """Only those of the output count."""
-        found = []
-        for joint in range(self.m):
-            values = self._ask(ask, joint, {}, (*QUERY, MoteusRegister.HOME_STATE)) or {}
-            at_output = values.get(MoteusRegister.HOME_STATE) == HOMED_AT_OUTPUT
-            found.append(values.get(MoteusRegister.POSITION, math.nan) * math.tau if at_output else math.nan)
-        return found
+    def position(self, joint: int, ask: Ask) -> float:
+        """Only that of the output counts."""
+        values = self._ask(ask, joint, {}, (*QUERY, MoteusRegister.HOME_STATE)) or {}
+        at_output = values.get(MoteusRegister.HOME_STATE) == HOMED_AT_OUTPUT
+        return values.get(MoteusRegister.POSITION, math.nan) * math.tau if at_output else math.nan
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
         """Stopped, and referenced to its output; torque and watchdog go with every command."""

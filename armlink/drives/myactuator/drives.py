@@ -150,9 +150,9 @@ class MyActuatorDrives(UntoldPowerDrives[MyActuatorMemory]):
         wrong = f"the arm file states model {stated}" if model and stated and model != stated else ""
         return self.present(joint, f"MyActuator {told}".strip(), firmware=str(version or ""), mismatch=wrong)
 
-    def positions(self, ask: Ask) -> list[float]:
-        told = [self._ask(ask, joint, RmdCommand.ANGLE, frames.unpack_angle) for joint in range(self.m)]
-        return [math.nan if each is None else each for each in told]
+    def position(self, joint: int, ask: Ask) -> float:
+        told = self._ask(ask, joint, RmdCommand.ANGLE, frames.unpack_angle)
+        return math.nan if told is None else told
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
         """Off, and read; nothing is written, for these drives keep what is written in their flash."""

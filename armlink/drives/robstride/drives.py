@@ -156,9 +156,9 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         serial = ask(_extended(frames.identity_frame(settings.id, settings.host)), unique_id)
         return self.absent(joint) if serial is None else self.present(joint, f"RobStride {settings.model}", serial)
 
-    def positions(self, ask: Ask) -> list[float]:
-        found = [self.read_parameter(ask, joint, RobStrideParameter.POSITION) for joint in range(self.m)]
-        return [math.nan if position is None else position for position in found]
+    def position(self, joint: int, ask: Ask) -> float:
+        found = self.read_parameter(ask, joint, RobStrideParameter.POSITION)
+        return math.nan if found is None else found
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
         """Stopped, motion mode, torque limit, deadman, each read back."""

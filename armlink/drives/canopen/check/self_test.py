@@ -56,11 +56,7 @@ class CanopenSelfTest:
             if services.joint in missing:
                 self.checks.add(services.joint, "answers", "failed", f"no answer from node {services.node}")
                 continue
-            try:
-                self.checks.add(services.joint, "identity", "passed", self._identity(services, row))
-            except ArmlinkError as error:
-                self.checks.add(services.joint, "identity", "failed", str(error))
-            else:
+            if self.checks.attempt(services.joint, "identity", partial(self._identity, services, row)):
                 self._look_at(services, row)
         if not missing:
             self.checks.results += link.turns.results(link.read_positions())
