@@ -9,7 +9,7 @@ from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import MessagePort, receive_message
 from armlink.bus.port import Port, interface_fault
-from armlink.bus.sockets.socket_port import SocketPort, StampedSocketPort
+from armlink.bus.sockets.socket_port import SocketPort
 from armlink.clock import Clock
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class SocketCanBus(PythonCanBus):
         return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
 
     def open_listening_port(self) -> Port:
-        return StampedSocketPort(self.bus.socket, self.channel_info, self.fd)
+        return SocketPort(self.bus.socket, self.channel_info, self.fd, stamped=True)
 
 
 class MulticastBus(PythonCanBus):
@@ -70,21 +70,17 @@ class MulticastBus(PythonCanBus):
         super().__init__(bus, name)
         self._ports: list[MulticastPort] = []
 
-    def open_port(self, as_node: bool = False) -> Port:
+    def open_port(self, as_node: bool = False, stamped: bool = False) -> Port:
         from armlink.bus.sockets.multicast_port import MulticastPort
 
-        return self._open(MulticastPort, as_node)
-
-    def open_listening_port(self) -> Port:
-        from armlink.bus.sockets.multicast_port import StampedMulticastPort
-
-        return self._open(StampedMulticastPort)
-
-    def _open(self, kind: "type[MulticastPort]", as_node: bool = False) -> Port:
         inner = self.bus._multicast  # python-can has no public access to the group
-        port = kind(inner._socket, (inner.group, inner.port), inner.hop_limit, self.channel_info, self.fd, as_node)
+        group, name = (inner.group, inner.port), self.channel_info
+        port = MulticastPort(inner._socket, group, inner.hop_limit, name, self.fd, as_node, stamped)
         self._ports.append(port)
         return port
+
+    def open_listening_port(self) -> Port:
+        return self.open_port(stamped=True)
 
     def shutdown(self) -> None:
         for port in self._ports:

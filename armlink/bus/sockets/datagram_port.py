@@ -12,6 +12,7 @@ import struct
 import time
 from abc import ABC, abstractmethod
 from collections import deque
+from typing import Any
 
 from armlink.bus.port import ERROR, Frame, InterfaceDown, Stamped
 from armlink.errors import BusFault
@@ -30,15 +31,25 @@ _FULL = (errno.ENOBUFS, errno.EAGAIN)
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS, _SO_MEMINFO = 33, 35, 55
 _DROPS = struct.Struct("=32xI")  # the last of the numbers of SO_MEMINFO: frames that the receive queue had no room for
 _STAMP = struct.Struct("=qq")  # wall clock [s], [ns]
+_CONTROL = socket.CMSG_SPACE(_STAMP.size)
 _CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read within this time, or this often
 
 
 class DatagramPort(ABC):
-    """Port on sockets; counts error frames."""
+    """Port on sockets; counts error frames. A listener's is read by `wait` and `take_all`, not by `receive`."""
 
-    def __init__(self, name: str, receiving: socket.socket, sending: socket.socket, as_node: bool) -> None:
-        """`name` of the bus for messages; both sockets may be the same; `as_node` as in CanBus.open_port."""
+    longest: int
+    """Size of a datagram [bytes]."""
+
+    def __init__(
+        self, name: str, receiving: socket.socket, sending: socket.socket, as_node: bool, stamped: bool
+    ) -> None:
+        """`name` of the bus for messages; both sockets may be the same; `as_node` as in CanBus.open_port; `stamped`:
+        for a listener, with the kernel's timestamps."""
         self.errors = 0
+        if stamped:
+            receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._began = time.monotonic()
         self._as_node, self._name = as_node, name
         self._receiving, self._send = receiving, sending.send
         self._waiting: deque[Frame] = deque()
@@ -52,9 +63,13 @@ class DatagramPort(ABC):
     def _encode(self, can_id: int, data: bytes) -> bytes: ...
 
     @abstractmethod
+    def _decoded(self, datagram: bytes, sender: Any) -> Frame | None:
+        """The frame of a datagram, with flags in its identifier; None if it is none for the reader: its own echo, or
+        malformed."""
+
+    @abstractmethod
     def _take(self) -> Frame | None:
-        """The frame of the next datagram, with flags in its identifier; None if it is none for the reader: its own
-        echo, or malformed. Raises OSError."""
+        """The frame of the next datagram, decoded. Raises OSError."""
 
     @property
     def dropped(self) -> int:
@@ -127,19 +142,6 @@ class DatagramPort(ABC):
         fault = InterfaceDown if error.errno == errno.ENETDOWN else BusFault
         return fault(f"bus {self._name}: cannot receive: {error.strerror}")
 
-
-class StampingPort(DatagramPort):
-    """With the kernel's timestamps, for listeners: read by `wait` and `take_all`, not by `receive`."""
-
-    def __init__(self, name: str, receiving: socket.socket, sending: socket.socket, as_node: bool) -> None:
-        super().__init__(name, receiving, sending, as_node)
-        receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        self._began = time.monotonic()
-
-    @abstractmethod
-    def _take_stamped(self, control: int) -> tuple[Frame | None, list[tuple[int, int, bytes]]]:
-        """As `_take`, with the control messages of the datagram, which have so many bytes at most."""
-
     def wait(self, timeout: float) -> None:
         select.select([self._receiving], [], [], timeout)
 
@@ -154,11 +156,12 @@ class StampingPort(DatagramPort):
         frames: list[Stamped] = []
         for _ in range(MOST_DATAGRAMS):
             try:
-                frame, controls = self._take_stamped(socket.CMSG_SPACE(_STAMP.size))
+                datagram, controls, _, sender = self._receiving.recvmsg(self.longest, _CONTROL, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 break
             except OSError as error:
                 raise self._reception_fault(error) from None
+            frame = self._decoded(datagram, sender)
             if frame is not None and self._is_frame(frame[0]):
                 stamps = (_STAMP.unpack(content) for _, kind, content in controls if kind == _SO_TIMESTAMPNS)
                 seconds, nano = next(stamps, (0, 0))

@@ -15,7 +15,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 
 from armlink.bus.message_port import as_frame, as_message
 from armlink.bus.port import Frame
-from armlink.bus.sockets.datagram_port import DatagramPort, StampingPort
+from armlink.bus.sockets.datagram_port import DatagramPort
 from armlink.errors import BusFault, Stall
 
 LONGEST = 1024
@@ -36,6 +36,8 @@ _TYPES: dict[str, tuple[type, ...]] = {
 class MulticastPort(DatagramPort):
     """CAN over UDP multicast; with `fd` it sends CAN FD frames (bit-rate switch), without it ignores such frames."""
 
+    longest = LONGEST + 1
+
     def __init__(
         self,
         receiving: socket.socket,
@@ -44,10 +46,11 @@ class MulticastPort(DatagramPort):
         name: str,
         fd: bool = True,
         as_node: bool = False,
+        stamped: bool = False,
     ) -> None:
         """Open a socket that sends to `group` (address, port); `receiving` has joined it.
 
-        `name` of the bus for messages, `as_node` as in CanBus.open_port. Raises BusFault without a route to the group.
+        The rest is as of DatagramPort. Raises BusFault without a route to the group.
         """
         self.ignored = 0
         """Datagrams received that were no frames."""
@@ -55,7 +58,7 @@ class MulticastPort(DatagramPort):
         self._sending = sending = _connect(name, receiving.family, group, hop_limit)
         self._own = _address(sending.getsockname())
         _hear_one_group(receiving)
-        super().__init__(name, receiving, sending, as_node)
+        super().__init__(name, receiving, sending, as_node, stamped)
 
     def close(self) -> None:
         self._sending.close()
@@ -68,7 +71,7 @@ class MulticastPort(DatagramPort):
         return Stall(f"bus {self._name}: this machine accepted no datagrams for 50 ms: stop other programs on it")
 
     def _take(self) -> Frame | None:
-        return self._decoded(*self._receiving.recvfrom(LONGEST + 1, socket.MSG_DONTWAIT))
+        return self._decoded(*self._receiving.recvfrom(self.longest, socket.MSG_DONTWAIT))
 
     def _decoded(self, datagram: bytes, sender: tuple[Any, ...]) -> Frame | None:
         if _address(sender) == self._own:
@@ -82,14 +85,6 @@ class MulticastPort(DatagramPort):
         if self._as_node and not (message.is_error_frame or message.is_remote_frame):
             self._fd = message.is_fd
         return as_frame(message)
-
-
-class StampedMulticastPort(MulticastPort, StampingPort):
-    """With the kernel's timestamps, for listeners."""
-
-    def _take_stamped(self, control: int) -> tuple[Frame | None, list[Any]]:
-        datagram, controls, _, sender = self._receiving.recvmsg(LONGEST + 1, control, socket.MSG_DONTWAIT)
-        return self._decoded(datagram, sender), controls
 
 
 def message_in(datagram: bytes) -> can.Message | None:

@@ -5,7 +5,7 @@ import struct
 from typing import Any
 
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
-from armlink.bus.sockets.datagram_port import DatagramPort, StampingPort
+from armlink.bus.sockets.datagram_port import DatagramPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _NEVER_FD, _ON_WIRE = ERROR | REMOTE | CLASSICAL, 0xFFFFFFFF
@@ -13,12 +13,13 @@ _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
 
 
 class SocketPort(DatagramPort):
-    def __init__(self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False) -> None:
-        """`name` of the bus for messages; `fd`: the socket accepts CAN FD frames, and CAN FD frames are sent.
+    longest = _FD.size
 
-        `as_node` as in CanBus.open_port.
-        """
-        super().__init__(name, raw, raw, as_node)
+    def __init__(
+        self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False, stamped: bool = False
+    ) -> None:
+        """`fd`: the socket accepts CAN FD frames, and CAN FD frames are sent; the rest as of DatagramPort."""
+        super().__init__(name, raw, raw, as_node, stamped)
         self._fd, self._receive = fd, raw.recv
 
     def _encode(self, can_id: int, data: bytes) -> bytes:
@@ -28,15 +29,9 @@ class SocketPort(DatagramPort):
     def _take(self) -> Frame | None:
         return self._decoded(self._receive(_FD.size, socket.MSG_DONTWAIT))
 
-    def _decoded(self, datagram: bytes) -> Frame:
+    def _decoded(self, datagram: bytes, sender: Any = None) -> Frame:
         layout = _FD if len(datagram) == _FD.size else _CLASSIC
         if self._as_node:
             self._fd = layout is _FD
         can_id, length, _, data = layout.unpack(datagram)
         return can_id, data[:length]
-
-
-class StampedSocketPort(SocketPort, StampingPort):
-    def _take_stamped(self, control: int) -> tuple[Frame | None, list[Any]]:
-        datagram, controls, _, _ = self._receiving.recvmsg(_FD.size, control, socket.MSG_DONTWAIT)
-        return self._decoded(datagram), controls

@@ -16,7 +16,7 @@ from armlink.arm_file import Bus
 from armlink.bus.message_port import as_frame
 from armlink.bus.open import open_bus
 from armlink.bus.port import ERROR, EXTENDED, REMOTE
-from armlink.bus.sockets.multicast_port import MulticastPort, StampedMulticastPort, message_in
+from armlink.bus.sockets.multicast_port import MulticastPort, message_in
 
 GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000
@@ -313,7 +313,6 @@ def test_a_full_queue_counts_what_it_lost(port):
 def test_a_listener_gets_the_kernel_s_times(stock):
     with open_member() as bus:
         port = bus.open_listening_port()
-        assert isinstance(port, StampedMulticastPort)
         before = time.monotonic()
         for can_id in range(200):
             stock.send(message(can_id, b"t"))
@@ -333,7 +332,6 @@ def test_ipv6(monkeypatch):
     try:
         with open_member(channel=channel) as bus, can.Bus(channel, interface="udp_multicast", port=PORT) as stock:
             port = bus.open_port()
-            assert isinstance(port, MulticastPort)
             port.send(0x181, b"six")
             stock.send(message(0x182, b"back"))
             assert bytes(stock.recv(1.0).data) == b"six"
