@@ -13,8 +13,8 @@ from itertools import islice
 from typing import Any
 
 _HEADER = struct.Struct("<I")
-CHUNK = 1 << 16
-AT_ONCE = 64
+RECEIVE_BYTES = 1 << 16
+MESSAGES_A_CALL = 64
 """Messages that leave with one call of the system."""
 MOST_SAMPLES = 15_000
 """Samples that wait for a reader which is busy: a minute at 250 Hz; older ones are dropped."""
@@ -61,7 +61,7 @@ class Channel:
     def flush(self, timeout: float = 0.0) -> bool:
         """Send what the socket takes, waiting at most `timeout` seconds for it; whether all has left. Raises Closed."""
         while self._waiting:
-            contents = [content for _, content in islice(self._waiting, AT_ONCE)]
+            contents = [content for _, content in islice(self._waiting, MESSAGES_A_CALL)]
             contents[0] = contents[0][self._sent :]
             try:
                 self._took(self._socket.sendmsg(contents))
@@ -98,7 +98,7 @@ class Channel:
         gone = False
         while True:
             try:
-                content = self._socket.recv(CHUNK)
+                content = self._socket.recv(RECEIVE_BYTES)
             except BlockingIOError:
                 break
             except OSError:
@@ -108,7 +108,7 @@ class Channel:
                 gone = True
                 break
             self._received += content
-            if len(content) < CHUNK:
+            if len(content) < RECEIVE_BYTES:
                 break
         messages, start = [], 0
         while len(self._received) - start >= _HEADER.size:

@@ -14,7 +14,7 @@ from typing import Any
 
 import can
 
-from armlink.bus.sockets.socket_port import SocketPort
+from armlink.bus.sockets.datagram_port import SocketPort
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "armlink"))
 from fake_joints import FakeBus, make_arm

@@ -32,11 +32,11 @@ import yaml
 from armlink.arm_file import ArmFile, bundled_arms, load_arm
 from armlink.bus.frame_bits import frame_bits
 from armlink.bus.port import Port
-from armlink.bus.sockets.socket_port import SocketPort
+from armlink.bus.sockets.datagram_port import SocketPort
 from armlink.link.link import Link
 from armlink.link.types import Setpoints
 from armlink.loop import cycle_process, process
-from armlink.loop.realtime import SIMULATED, prepare
+from armlink.loop.realtime import SIMULATED_PRIORITY, prepare
 from armlink.loop.remote_link import RemoteLink
 
 SWAY, TURN = 0.05, 4.0
@@ -71,7 +71,7 @@ class PairBus:
 
 def carry(one: socket.socket, other: socket.socket, bit: float) -> None:
     """The wire between two sockets: one frame at a time, the lowest identifier first; a bit takes `bit` [s]."""
-    prepare(SIMULATED)
+    prepare(SIMULATED_PRIORITY)
     ends, waiting, free, number = {one: other, other: one}, list[tuple[int, int, bytes, socket.socket]](), 0.0, 0
     while True:
         for end in select.select(list(ends), [], [], 0.0 if waiting else None)[0]:
@@ -112,7 +112,7 @@ def simulate(path: str, number: int) -> None:
     arm = load_arm(path)
     bus = PairBus(socket.socket(fileno=number))  # keeps the socket open
     server = ArmServer(SimulatedArm(arm, Truth.of(arm)), bus)
-    prepare(SIMULATED)
+    prepare(SIMULATED_PRIORITY)
     print("ready", flush=True)
     try:
         server.run()

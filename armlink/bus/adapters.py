@@ -9,7 +9,7 @@ from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import MessagePort, receive_message
 from armlink.bus.port import Port, interface_fault
-from armlink.bus.sockets.socket_port import SocketPort
+from armlink.bus.sockets.datagram_port import SocketPort
 from armlink.clock import Clock
 
 log = logging.getLogger(__name__)

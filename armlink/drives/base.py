@@ -32,7 +32,7 @@ BROADCAST = -1
 """Stands for the joint of a frame to all of them, or of any of them."""
 ANY = -1
 """Stands for every identifier in `routes`."""
-ANSWER, TRIES = 0.1, 3
+ANSWER_TIME, TRIES = 0.1, 3
 """Default patience for an answer [s], and how often a request is sent."""
 LONG_IDENTIFIER = 25
 """Bits that an identifier of 29 bits takes more than one of 11, stuff bits included."""
@@ -42,7 +42,7 @@ class Ask(Protocol):
     """Requests to drives outside of the cycle. Frames that are no answer still reach `take`."""
 
     def __call__(
-        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER, tries: int = TRIES
+        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER_TIME, tries: int = TRIES
     ) -> T | None:
         """Send `frame`; the first value that `answer(can_id, data)` gives for a frame that comes within `timeout` [s],
         the request being repeated up to `tries` times. None if nothing answers."""

@@ -95,11 +95,11 @@ class Result:
 
 ANSWER_CYCLES = 50
 """Cycles without power, to see whether each is answered."""
-ANSWERED = 0.9
+ANSWERED_SHARE = 0.9
 """Share of them that must be answered, in their cycle or late."""
-PATIENCE = 3.0
+SILENCE_DEADLINES = 3.0
 """So many deadlines are waited for a reaction to a silent host."""
-HELD = 0.05
+HOLD_TOLERANCE = 0.05
 """A joint that moves further than this while it should hold ends a self-test [rad]."""
 
 
@@ -147,5 +147,5 @@ def count_answers(
     for now, then, timely in zip(board.came, before, in_time.tolist(), strict=True):
         came = min(now - then, cycles)
         late = f", {came - timely} of them late: this host, the bus or the drive is busy" if came > timely else ""
-        found.append((came >= ANSWERED * cycles, f"replies came in {came} of {cycles} cycles{late}"))
+        found.append((came >= ANSWERED_SHARE * cycles, f"replies came in {came} of {cycles} cycles{late}"))
     return found

@@ -19,7 +19,7 @@ from armlink.errors import BadInput, BusFault
 
 DAMPING_SHARE = 0.9
 """Damping takes at most this share of the torque limit; the rest is for rounding."""
-SOFTER, SOFTER_STEPS = 0.8, 30
+GAIN_FACTOR, GAIN_STEPS = 0.8, 30
 """Factor by which both gains are lowered, again and again, while the sum of the law is beyond the limit."""
 Steps = tuple[int, int, int, int, int]
 ON, POSITION, TORQUE = Power.ON, int(Mode.POSITION), int(Mode.TORQUE)
@@ -212,10 +212,10 @@ def round_within(command: MitCommand, grid: Grid, limits: Limits, position: floa
     quantum = grid.torque.span / grid.torque.most
     t = _torque_within(t - math.ceil(abs(beyond) / quantum) * (1 if beyond > 0 else -1), grid, most)
     torque = grid.torque.value(t)
-    for _ in range(SOFTER_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
+    for _ in range(GAIN_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
         if abs(pull + torque) <= most:
             return q, dq, kp, kd, t
-        kp, kd = int(SOFTER * kp), int(SOFTER * kd)
+        kp, kd = int(GAIN_FACTOR * kp), int(GAIN_FACTOR * kd)
         pull = _pull(q, dq, kp, kd, grid, position, velocity)
     return q, dq, 0, 0, t
 

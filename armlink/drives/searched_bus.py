@@ -6,7 +6,7 @@ from typing import TypeVar
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame, Port
 from armlink.clock import MonotonicClock
-from armlink.drives.base import ANSWER, TRIES
+from armlink.drives.base import ANSWER_TIME, TRIES
 
 T = TypeVar("T")
 SEARCH_SECONDS = 0.3
@@ -53,7 +53,7 @@ class SearchedBus:
         return None
 
     def __call__(
-        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER, tries: int = TRIES
+        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER_TIME, tries: int = TRIES
     ) -> T | None:
         for _ in range(tries):
             self.send(*frame)

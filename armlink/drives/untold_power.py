@@ -13,9 +13,9 @@ from typing import TypeVar
 from armlink.drives.base import BasicDrives, DriveMemory
 from armlink.drives.orders import Power
 
-LOADED = 0.02
+LOAD_SHARE = 0.02
 """A torque above this share of the drive's range or limit shows whether the drive makes it."""
-FOLLOWS = 0.5
+FOLLOWED_SHARE = 0.5
 """A drive that makes less than this share of the torque that is asked for does not follow."""
 
 
@@ -77,6 +77,6 @@ class UntoldPowerDrives(BasicDrives[U]):
 
 def makes(torque: float, wanted: float, most: float) -> bool | None:
     """Whether a drive makes a torque that it is asked for [N·m]; None where that is too little of `most` to tell."""
-    if not abs(wanted) > LOADED * most:
+    if not abs(wanted) > LOAD_SHARE * most:
         return None
-    return torque * math.copysign(1.0, wanted) > FOLLOWS * abs(wanted)
+    return torque * math.copysign(1.0, wanted) > FOLLOWED_SHARE * abs(wanted)

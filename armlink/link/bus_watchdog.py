@@ -4,7 +4,7 @@ from armlink.bus.port import EXTENDED, REMOTE
 
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
-CROWD_PER_JOINT, CROWD = 5, 30
+CROWD_PER_JOINT, CROWD_FRAMES = 5, 30
 """Normal limit of frames per cycle: 5 per joint, ours included, and 30 others (a scan by another tool is short)."""
 OWN_RATE = 250.0
 """Drives that send by their own clock do so 5 times per joint at this rate at most [Hz], whatever the cycle."""
@@ -13,12 +13,12 @@ CROWDED_CYCLES = 10
 is a backlog, of a host or a device that had no processor for a while."""
 DOUBLE_CYCLES = 3
 """Consecutive cycles with two readings of one joint that mean a second node with its id."""
-FORGIVEN = 250
+FORGIVEN_READINGS = 250
 """Missed readings that may still arrive, several per cycle: one second of SYNCs at 250 Hz, from an arm that was late
 itself and catches up."""
 SLOW_CYCLES = 4
 """A drive that sends velocity and state apart from its position does so after every so many SYNCs."""
-EXCESS = 3
+EXCESS_READINGS = 3
 """So many readings more than a drive sends mean a second sender; one may be early, none is sent twice."""
 TORQUE_MEMORY = 10
 """Positions after which a torque too many is forgotten: a position was lost."""
@@ -29,7 +29,7 @@ class BusWatch:
 
     def __init__(self, joints: int, sends: float = 1.0) -> None:
         """`sends`: how often a drive sends in a cycle at most; more than once where its own clock is faster."""
-        self._crowd = CROWD_PER_JOINT * joints * sends + CROWD
+        self._crowd = CROWD_PER_JOINT * joints * sends + CROWD_FRAMES
         self._doubled: set[int] = set()
         self.others: dict[int, int] = {}
         """Frames of this cycle that were no readings of the fast way, by identifier."""
@@ -74,15 +74,15 @@ class BusWatch:
 
     def again(self, joint: int) -> None:
         """A second reading of a joint arrived in this cycle: a late one, or more readings than SYNCs."""
-        self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)
+        self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN_READINGS)
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
 
     def slow(self, joint: int) -> None:
         """Velocity and state of a joint came apart from its position: more often than it sends them, or not."""
         due = self.syncs // SLOW_CYCLES + 1
-        count = self._slow_readings[joint] = max(self._slow_readings[joint] + 1, due - FORGIVEN // SLOW_CYCLES)
-        if count >= due + EXCESS:
+        count = self._slow_readings[joint] = max(self._slow_readings[joint] + 1, due - FORGIVEN_READINGS // SLOW_CYCLES)
+        if count >= due + EXCESS_READINGS:
             self.forged = joint
 
     def torque_alone(self, joint: int) -> None:
@@ -91,7 +91,7 @@ class BusWatch:
         self._positions_before[joint] = self.readings[joint]
         kept = max(self._torques_more[joint] - (1 + 1 / TORQUE_MEMORY) * positions, 0.0)
         self._torques_more[joint] = kept + 1.0
-        if kept + 1.0 > EXCESS:
+        if kept + 1.0 > EXCESS_READINGS:
             self.forged = joint
 
     def cycle_ends(self, frames: int, periods: float) -> None:

@@ -36,12 +36,12 @@ ENABLE_SECONDS = 3.0
 """The joints must reach a commanded power state within this time."""
 STOP_CYCLES = 25
 """Cycles in which a stop is repeated until every joint reports it."""
-MEMORY = 1.0
+LATENESS_MEMORY = 1.0
 """So long after the host was late, joints that stop by themselves are put down to it [s]: their watches run on the
 heartbeat too, which they may miss for twice `link.deadline`."""
 BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
-BELIEVED_AGAIN = 0.1
+BELIEVED_DISTANCE = 0.1
 """A reading this near to where its joint was led last is believed again [rad]."""
 LEAD_SHARE = 0.05
 """Of the newest cycle in the mean time from a wake to its frames."""
@@ -254,7 +254,7 @@ class Commander:
         believed = self._believed.get(joint)
         if believed is None:
             return False
-        if others.contradicted or not abs(seen.position - believed) <= BELIEVED_AGAIN:
+        if others.contradicted or not abs(seen.position - believed) <= BELIEVED_DISTANCE:
             return True
         del self._believed[joint]
         return False
@@ -405,14 +405,14 @@ class Commander:
         what the state of the bus explains to that."""
         fault = self._drive_fault(now, modes)
         shown = bus_fault(self.names, self.loop.watch, self.loop.dropped)
-        if self._gap_at + MEMORY >= now and self._gap > self.max_age:
+        if self._gap_at + LATENESS_MEMORY >= now and self._gap > self.max_age:
             return HostLate(self._gap, self.max_age, self._own_stop())
         watch = self.loop.watch
         if shown is not None and (fault is None or watch.reception or watch.intruder or isinstance(fault, Silence)):
             return BusFault(shown)
         if fault is None:
             return None
-        if self._gap_at + MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
+        if self._gap_at + LATENESS_MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
             stopped = self._own_stop()
             if stopped or isinstance(fault, Silence):
                 return HostLate(self._gap, self.max_age, stopped or str(fault))
@@ -441,7 +441,7 @@ class Commander:
     def _note_gap(self, seconds: float, now: float) -> None:
         """No commands were sent for so long before `now` [s]; the longest of late is kept."""
         gap = seconds - self.period
-        if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
+        if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + LATENESS_MEMORY):
             self._gap, self._gap_at = gap, now
 
     def settle(self) -> None:

@@ -18,7 +18,7 @@ from armlink.drives.board import Board, DriveEvent
 from armlink.drives.orders import Order, Power, Reading, law_torque, power_code
 from armlink.errors import BusFault, HostLate, Refused
 from armlink.link.bus_watchdog import MOST_FRAMES, OWN_RATE, BusWatch
-from armlink.link.gate import EXACT
+from armlink.link.gate import ROUNDING_FACTOR
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
 from armlink.link.keeper import Keeper
@@ -26,7 +26,7 @@ from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
 """Share of a period after the commands in which their replies are waited for."""
-EARLIER, LATER = 0.998, 1.03
+EARLIER_FACTOR, LATER_FACTOR = 0.998, 1.03
 """The loop sleeps until the replies should all have come, instead of waking for each: a little earlier from cycle to
 cycle while they all had, later once one had not."""
 LEAST_REST = 1e-4
@@ -273,7 +273,7 @@ class Loop:
         if unhurried:
             return delay
         if board.awaited <= 0:
-            self._rest = EARLIER * rested
+            self._rest = EARLIER_FACTOR * rested
             return delay
         while board.awaited > 0 and delay < patience and not self.watch.flooded:
             in_time = self.receive(patience - delay)
@@ -281,7 +281,7 @@ class Loop:
             delay = clock.now() - now
             if not in_time:
                 break
-        self._rest = min(max(LATER * rested, LEAST_REST), LATER * delay, patience)
+        self._rest = min(max(LATER_FACTOR * rested, LEAST_REST), LATER_FACTOR * delay, patience)
         return delay
 
     def _encode(self, orders: Sequence[Order], now: float) -> list[Frame]:
@@ -321,7 +321,7 @@ class Loop:
                         known, limits = drives.memory[joint], drives.limits_of(joint)
                         torque = law_torque(order, known.position, known.velocity)
                         inside = limits.lower <= order.position <= limits.upper or not order.kp > 0
-                        within = inside and abs(torque) <= EXACT * limits.max_torque
+                        within = inside and abs(torque) <= ROUNDING_FACTOR * limits.max_torque
                         if order.power is Power.ON and not within:
                             raise Refused(f"keeper: the frame to {drives.where(joint)} exceeds a limit")
                     found.append((can_id | group.tag, data))

@@ -39,9 +39,9 @@ BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
 SAMPLE_AGE, STATE, CONTRADICTION = "sample age", "state", "contradiction"
 VELOCITY, WINDOW, ENTRY, FOLLOWING = "velocity", "window", "entry", "following error"
 FALSE_TORQUE = "false torque"
-LEASH = 0.97
+TORQUE_LIMIT_SHARE = 0.97
 """Share of max_torque that gains, targets and feed-forward may come to together; the rest is for their rounding."""
-EXACT, ROUNDED = 1 + 1e-6, 1e-6
+ROUNDING_FACTOR, POSITION_ROUNDING = 1 + 1e-6, 1e-6
 """Rounding of a bound in single precision: relative, and absolute for positions [rad]."""
 TORQUE_SHARE = 0.15
 """A drive's torque reading may differ so much from what its gains and order come to, as a share of max_torque, ..."""
@@ -54,7 +54,7 @@ that codes torques 3.4 times too large would else be at 2.8 times max_velocity b
 (`tests/campaigns/false_readings.py --family six-damiao six-robstride`)."""
 EASED_SPEED = 0.72
 """Share of the speed limit at the beginning: a little above max_velocity, so that a joint may be under way."""
-LED_BACK = 1e-3
+RETURN_ROUNDING = 1e-3
 """Rounding of a target outside the window, on its way back [rad]."""
 
 
@@ -165,7 +165,7 @@ def pass_gate(
 
 def _leashed(limits: JointLimits, mode: int, torque: float, goal: float, start: float, seen: Seen) -> Order:
     """An order with gains whose torque kp (q* − q) + kd (v* − v) + τ is within the limit, as the joint is seen now."""
-    kp, kd, most = limits.kp, limits.kd, limits.max_torque * LEASH
+    kp, kd, most = limits.kp, limits.kd, limits.max_torque * TORQUE_LIMIT_SHARE
     stretch = most / kp
     position = _within(goal, seen.position - stretch, seen.position + stretch)
     velocity = (position - start) / limits.period if position == goal and limits.period else 0.0
@@ -273,13 +273,13 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
     power, _, mode, position, rate, torque, kp, kd, _ = sent
     if power is not ON:
         return ""
-    most = limits.most_sent * EXACT
+    most = limits.most_sent * ROUNDING_FACTOR
     if mode in TORQUE_MODES:
         return "" if abs(torque) <= most else f"torque {torque:.6g} N·m"
     if mode not in POSITION_MODES:
         return ""
     goal, lower, upper = passed.position, limits.lower, limits.upper
-    room = (ROUNDED if lower <= goal <= upper else LED_BACK) + (EXACT - 1) * abs(position)
+    room = (POSITION_ROUNDING if lower <= goal <= upper else RETURN_ROUNDING) + (ROUNDING_FACTOR - 1) * abs(position)
     if not (goal if goal < lower else lower) - room <= position <= (goal if goal > upper else upper) + room:
         return f"position {position:.6g} rad"
     if not (kp or kd):

@@ -10,7 +10,7 @@ from armlink.model_file import compile_model
 
 POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
-PRESS_IN = 0.05
+PRESS_DEPTH = 0.05
 """A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
 OVERSPEED = 1.4
 """A joint under torque control is refused this many times as fast as max_velocity: it then stops before 1.5 times."""
@@ -19,12 +19,12 @@ SERVO_OVERSPEED = 3.0
 SERVO_SPEED = 3.0
 """A joint under position control may turn this fast whatever max_velocity is [rad/s]: one that is enabled while it
 sinks is caught at that speed."""
-FOLLOWING = 0.5
+FOLLOWING_ERROR = 0.5
 """A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
 calib takes a joint for blocked long before."""
 RANGE_ROUNDING = 1e-6
 """Relative rounding of a range in a 32-bit float, which registers hold."""
-OUTSIDE = 0.1
+WINDOW_MARGIN = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
 
@@ -54,7 +54,7 @@ def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:
 
 def target_window(lower: float, upper: float) -> tuple[float, float]:
     """Where a position target may lie [rad]: the stops, the position sensor's error, and some press-in."""
-    margin = POSITION_GAIN_ERROR * max(-lower, upper) + PRESS_IN
+    margin = POSITION_GAIN_ERROR * max(-lower, upper) + PRESS_DEPTH
     return lower - margin, upper + margin
 
 
@@ -114,8 +114,8 @@ def gate_limits(limits: Limits, gains: Gains | None = None, max_torque: float | 
         upper=limits.upper,
         overspeed=OVERSPEED * limits.max_velocity,
         servo_overspeed=max(SERVO_OVERSPEED * limits.max_velocity, SERVO_SPEED),
-        following=FOLLOWING,
-        outside=OUTSIDE,
+        following=FOLLOWING_ERROR,
+        outside=WINDOW_MARGIN,
         max_age=limits.deadline,
         period=limits.period,
         kp=gains.kp if gains else 0.0,

@@ -1,17 +1,17 @@
 """Integral term of position control, for drives that have none: it takes over what gravity asks for.
 
-The feed-forward τ grows by RATE · (kp (q* − q) + kd (v* − v)): what the drive's gains must still add becomes
-feed-forward within 1 / RATE. Without the velocity's share a joint of inertia J would be stable for RATE < kd / J alone,
+With r = INTEGRAL_RATE the feed-forward τ grows by r · (kp (q* − q) + kd (v* − v)): what the drive's gains must still
+add becomes feed-forward within 1 / r. Without the velocity's share a joint of inertia J would be stable for r < kd / J,
 which the first joints of an arm come close to, since MIT frames carry little damping. With it the limit is
-RATE · J < kd (1 + RATE · kd / kp), which a joint with a load on its lever passes: the term would then feed its swing.
+r · J < kd (1 + r · kd / kp), which a joint with a load on its lever passes: the term would then feed its swing.
 So it follows only errors that keep their sign; a swing about the target is left to the drive's damping.
 """
 
 import math
 
-from armlink.link.gate import LEASH, POSITION_MODES, JointLimits, Seen
+from armlink.link.gate import POSITION_MODES, TORQUE_LIMIT_SHARE, JointLimits, Seen
 
-RATE = 5.0
+INTEGRAL_RATE = 5.0
 """[1/s]."""
 SWING_TIME = 0.5
 """Time over which errors are averaged, to tell a swing from what is to be taken over [s]."""
@@ -24,7 +24,7 @@ def slowest_time(kp: float, kd: float) -> float:
 
     What is left of a disturbance fades with kd / kp, and with the term itself.
     """
-    return max(1.0 / RATE, kd / kp) if kp > 0 else 0.0
+    return max(1.0 / INTEGRAL_RATE, kd / kp) if kp > 0 else 0.0
 
 
 class Integral:
@@ -50,9 +50,9 @@ class Integral:
             self.torque, self._mean, self._size = produced, error, abs(error)
         share = self._steady_share(error, limits.period / SWING_TIME)
         if abs(error) > DEADBAND:
-            most = limits.max_torque * LEASH
+            most = limits.max_torque * TORQUE_LIMIT_SHARE
             short = rate - seen.velocity if math.isfinite(seen.velocity) else 0.0
-            grown = self.torque + share * RATE * limits.period * (limits.kp * error + limits.kd * short)
+            grown = self.torque + share * INTEGRAL_RATE * limits.period * (limits.kp * error + limits.kd * short)
             self.torque = max(-most, min(most, grown))
         return self.torque
 

@@ -28,7 +28,7 @@ SENDINGS, SENDING_PAUSE = 3, 0.01
 """How often the frames are sent, since one may be lost, and the time between [s]."""
 END_SECONDS = 2.0
 """Time for a keeper to end when its host closes the arm [s]."""
-REMEMBERED = 4
+REMEMBERED_CYCLES = 4
 """So many cycles are the frames of a keeper told from those of another host [cycles]."""
 READY = "ready"
 
@@ -41,7 +41,7 @@ class Keeper:
         self._process, self._channel = start_process(("-m", "armlink.link.keeper"))
         self.lost = self.heard = False
         """Whether it has ended, or reads no more; whether it was heard on the bus."""
-        self._told: deque[tuple[Frame, ...]] = deque(maxlen=REMEMBERED)
+        self._told: deque[tuple[Frame, ...]] = deque(maxlen=REMEMBERED_CYCLES)
         told: str | None = None
         self._channel.put((section, spec))
         with contextlib.suppress(Closed):

@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     import can
 
 log = logging.getLogger("armlink")
-PATIENCE = 2.5
+READING_AGE_PERIODS = 2.5
 """Readings may be this many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Another host is listened for before anything is sent to the nodes: this many periods, and at least this long [s],
 since a host on a busy computer may pause for some 0.05 s."""
-BACKLOGS = 5
+BACKLOG_TRIES = 5
 """So often all frames that are there are taken in before the start: drives that send by their own clock go on while a
 busy computer has not read them yet."""
 ANSWER_SECONDS = 5.0
@@ -246,7 +246,7 @@ class Link(Calibrations):
 
     def require_alone(self) -> None:
         """Listen before anything is set; raises BusFault where another host is on the bus."""
-        for _ in range(BACKLOGS):
+        for _ in range(BACKLOG_TRIES):
             self._loop.watch.clear()
             self._loop.drain()
             if not self._loop.watch.flooded:
@@ -446,7 +446,7 @@ class Link(Calibrations):
 
         While readings are late the row is repeated, so that the motion waits for the arm.
         """
-        patience = PATIENCE * self.period
+        patience = READING_AGE_PERIODS * self.period
         for row in range(len(setpoints)):
             command = setpoints.command(row)
             sample = self.cycle(command)

@@ -34,11 +34,11 @@ from armlink.link.types import Sample, Stats
 if TYPE_CHECKING:
     import can
 
-SLEEP = 0.04
+SLEEP_SECONDS = 0.04
 """Frames with a time stamp may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
 of a full bus."""
 
-RESOLUTION = 1e-9
+CLOCK_RESOLUTION = 1e-9
 """Times closer than this are the same [s]: a simulated clock may not move by less."""
 
 
@@ -161,7 +161,7 @@ class Listener(HeardArm, Calibrations):
             end = self.clock.now() + timeout
             while not self._ready:
                 remaining = end - self.clock.now()
-                if remaining <= RESOLUTION:
+                if remaining <= CLOCK_RESOLUTION:
                     return None
                 self._hear(remaining)
         self._sample, self._sent = self._ready.popleft()
@@ -175,7 +175,7 @@ class Listener(HeardArm, Calibrations):
             if at_once:
                 port.wait(seconds)
             else:
-                self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
+                self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP_SECONDS))
             frames = port.take_all()
         else:
             frame = port.receive(seconds)

@@ -23,17 +23,17 @@ from armlink.link.bus_watchdog import SLOW_CYCLES
 
 LAGS = (1, 2, 4, 8, 16, 32)
 """Mean speeds are taken over so many cycles: the short ones are quick, the long ones exact."""
-PRESENT = LAGS[:4]
+PRESENT_LAGS = LAGS[:4]
 """These tell of the present: a mean over up to eight cycles."""
 REACTION_CYCLES = 3
 """A joint that this reading does not stop is stopped by the next: the reading is a cycle old, the next comes a cycle
 later, and an order acts within a third."""
-MEMORY = 0.5
+WAY_MEMORY = 0.5
 """Ways by positions and by velocities are compared over this time [s]: long against a drive's filter, and so short that
-a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY."""
-WAY = 0.01
+a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY_TOLERANCE."""
+WAY_TOLERANCE = 0.01
 """Difference of the ways that compliance, backlash and a velocity's zero error explain [rad]."""
-SHARE = 0.3
+WAY_SHARE = 0.3
 """Difference of the ways, or speeds, as a share of the greater: scales that are off by 10 to 40 % are for
 `armlink check --scales`, which must be able to move the arm that it examines."""
 FILTER_TIME = 0.01
@@ -68,7 +68,7 @@ class _Joint:
         self.apart = self.way = self.claimed = self.peak = self.width = self.age = 0.0
         """Way by positions less that by velocities, way of the two together, way that velocities claimed for the part
         of a cycle of which they do not tell [rad]; greatest speed [rad/s]; longest time in which a sample was taken,
-        greatest age of a velocity [s]. All fade with MEMORY."""
+        greatest age of a velocity [s]. All fade with WAY_MEMORY."""
 
 
 class MotionWatch:
@@ -141,9 +141,9 @@ class MotionWatch:
         most, delay = own.most, self._delay
         ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * most else least
         told_before, own.told = own.told, speed if age <= delay else 0.0
-        unseen = told_before > most and (1 - SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
+        unseen = told_before > most and (1 - WAY_SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
         oldest = own.age if own.age > delay else delay
-        explained = WAY + 2 * own.step + SHARE * own.way + own.claimed + (oldest + own.width) * own.peak
+        explained = WAY_TOLERANCE + 2 * own.step + WAY_SHARE * own.way + own.claimed + (oldest + own.width) * own.peak
         return proven, ahead, unseen or abs(own.apart) > explained
 
     def _extrapolated(self, own: _Joint, here: float, since: float, until: float) -> float:
@@ -180,7 +180,7 @@ class MotionWatch:
         else:
             moved, turned = here - own.before, told * elapsed
             if moved - turned == moved - turned:  # neither is NaN
-                keep = 1.0 - elapsed / MEMORY
+                keep = 1.0 - elapsed / WAY_MEMORY
                 if keep < 0.0:
                     keep = 0.0
                 own.apart = keep * own.apart + moved - turned
@@ -200,7 +200,7 @@ def _present(own: _Joint, here: float, until: float) -> tuple[float, float]:
     """Least present speed, by any of the means and by all of them [rad/s]."""
     at, positions, earliest, step = own.at, own.positions, own.earliest, own.step
     least, steady = 0.0, math.inf
-    for lag in PRESENT:
+    for lag in PRESENT_LAGS:
         row = at - lag
         longest = until - earliest[row]
         if longest > 0.0:

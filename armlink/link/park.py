@@ -12,13 +12,13 @@ from armlink.link.cycle import Commander
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.types import Sample, Tell
 
-PEAK = 1.875
+PEAK_SPEED_RATIO = 1.875
 """Peak speed over mean speed of the path, whose parameter is 10 s³ − 15 s⁴ + 6 s⁵."""
-LAG = 0.2
+BLOCKED_LAG = 0.2
 """A joint that stays this far behind its target on the way is blocked [rad]."""
 REST_SECONDS = 0.5
 """The arm rests in its pose for this long before the power goes [s]."""
-STOWED = 0.1
+POSE_TOLERANCE = 0.1
 """A joint that is further than this from its pose has not arrived [rad]."""
 TELL_SECONDS = 0.5
 """Time between two reports of progress [s]."""
@@ -26,10 +26,10 @@ LOWERING_SPEED = 0.1
 """An arm without a pose to park in is let down no faster [rad/s]: a hand's width a second at an arm's length."""
 LIGHT_LOAD = 0.05
 """Share of max_torque below which a load lets its joint down more slowly, so that it comes to rest where it hangs."""
-LOWERED = 0.01
+LOWERED_WAY = 0.01
 """An arm whose joints have all moved less than this within LOWERED_SECONDS rests [rad]."""
 LOWERED_SECONDS = 2.0
-"""See LOWERED [s]."""
+"""See LOWERED_WAY [s]."""
 LONGEST_LOWERING = 60.0
 """The power goes then, whether the arm rests or not [s]: half a turn at LOWERING_SPEED takes half of it."""
 
@@ -111,12 +111,11 @@ def park(link: StowableArm, tell: Tell) -> None:
             left = (len(path) - row) * link.period + REST_SECONDS
             tell(f"the arm moves to its parking pose, {left:.0f} s left; pressing Ctrl-C twice lets the arm fall")
         link.keep(target)
-        _require_following(
-            link, target, LAG, "stopped following its target (something is in the way, or its drive is too weak)"
-        )
+        how = "stopped following its target (something is in the way, or its drive is too weak)"
+        _require_following(link, target, BLOCKED_LAG, how)
     for _ in range(cycles(link, REST_SECONDS)):
         link.keep(goal)
-    _require_following(link, goal, STOWED, "did not arrive at its parking position")
+    _require_following(link, goal, POSE_TOLERANCE, "did not arrive at its parking position")
     _power_off(link)
     tell("the arm is in its parking pose, and its power is off")
 
@@ -165,13 +164,13 @@ def let_down(link: StowableArm, tell: Tell, why: str) -> None:
         here = link.latest_position
         target = np.clip(
             target - step * np.clip(load / light, -1.0, 1.0),
-            np.maximum(here - LAG, lower),
-            np.minimum(here + LAG, upper),
+            np.maximum(here - BLOCKED_LAG, lower),
+            np.minimum(here + BLOCKED_LAG, upper),
         )
         link.keep(target)
         if row % window == window - 1:
             here = link.latest_position
-            if np.abs(here - before).max() < LOWERED:
+            if np.abs(here - before).max() < LOWERED_WAY:
                 break
             before = here
     _power_off(link)
@@ -180,7 +179,7 @@ def let_down(link: StowableArm, tell: Tell, why: str) -> None:
 
 def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
     """Positions (K, n) [rad], one a cycle of `period` [s], from start to goal; no joint exceeds its speed [rad/s]."""
-    seconds = PEAK * float(np.max(np.abs(goal - start) / speed, initial=0.0))
+    seconds = PEAK_SPEED_RATIO * float(np.max(np.abs(goal - start) / speed, initial=0.0))
     count = max(1, math.ceil(seconds / period))
     s = np.arange(1, count + 1) / count
     way: Array = s**3 * (10 - 15 * s + 6 * s**2)

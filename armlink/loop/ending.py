@@ -12,11 +12,11 @@ from armlink.link.ends import EndCause
 from armlink.loop.messages import Drop, End, Told
 from armlink.termination import Dropped
 
-GRACE = 2.0
+GRACE_SECONDS = 2.0
 """After SIGTERM the job has this long to end this process [s]."""
 HANG_SECONDS = 10.0
 """A process that takes nothing, answers nothing, or says nothing at the end of its arm, for this time hangs [s]."""
-TOLD_EVERY = 0.2
+TELL_INTERVAL = 0.2
 """Job and loop hear from each other at least so often [s]."""
 OF_A_SERVICE = (signal.SIGTERM, signal.SIGABRT)
 """systemd sends them to every process of a unit: at its stop, and where its watchdog has run out."""
@@ -30,7 +30,7 @@ OF_ITS_OWN = (
 class Ending:
     """Signals to a group of processes are left to the job, which is in it: it ends this process, and says how.
 
-    A job that does not within GRACE after SIGTERM hangs, and this process then ends by itself. So it does when the job
+    A job that does not within GRACE_SECONDS after SIGTERM hangs, and this process then ends by itself. So it does when the job
     has gone: its end of the channel may live on in a process that the job has forked.
     """
 
@@ -48,7 +48,7 @@ class Ending:
     @property
     def due(self) -> bool:
         """Whether to end although the job is still there."""
-        return self._asked is not None and time.monotonic() - self._asked > GRACE
+        return self._asked is not None and time.monotonic() - self._asked > GRACE_SECONDS
 
     @property
     def orphaned(self) -> bool:
@@ -91,7 +91,7 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: C
         channel.put(End(cause))
         while runs() and time.monotonic() - heard < HANG_SECONDS:
             channel.flush()
-            channel.wait(TOLD_EVERY)
+            channel.wait(TELL_INTERVAL)
             try:
                 for message in channel.receive():
                     heard = time.monotonic()
@@ -106,5 +106,5 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: C
         pass
     channel.close()
     while runs() and time.monotonic() - heard < HANG_SECONDS:
-        time.sleep(TOLD_EVERY / 10)
+        time.sleep(TELL_INTERVAL / 10)
     return not runs()

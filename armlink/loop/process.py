@@ -31,7 +31,7 @@ from armlink.link.ends import EndCause, cause_of
 from armlink.link.gate import TORQUE_MODES
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
-from armlink.link.listener import RESOLUTION, Listener
+from armlink.link.listener import CLOCK_RESOLUTION, Listener
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.ending import Ending, telling
 from armlink.loop.messages import (
@@ -55,16 +55,16 @@ from armlink.loop.messages import (
 from armlink.loop.open import is_in_process
 from armlink.loop.realtime import prepare
 
-IDLE = 0.05
+IDLE_SECONDS = 0.05
 """Longest wait for the job while the joints are not enabled [s]."""
-SWITCH = 5e-4
+SWITCH_INTERVAL = 5e-4
 """Longest time for which another thread of this process holds up a cycle [s]."""
-SILENT = 3.0
+SILENT_SECONDS = 3.0
 """A job that says nothing for this long while joints are under torque control is gone [s]."""
-TALK_EVERY = 7e-3
+TALK_INTERVAL = 7e-3
 """Samples wait for each other for this long [s]: waking the job costs as much as half a cycle. While rows are played,
 the job is not heard more often either, and replies are waited for in those cycles alone."""
-SIGN_EVERY = 1.0
+SIGN_INTERVAL = 1.0
 """Time between two signs of life [s]."""
 RETRY_SECONDS = 1.0
 """Time between two attempts to open the bus of a kept arm [s]."""
@@ -78,7 +78,7 @@ ENABLING = ("enable", "recover")
 class DriveLoop:
     """The cycles of one link, and what the job asks for between them."""
 
-    talk_every = TALK_EVERY
+    talk_every = TALK_INTERVAL
 
     def __init__(self, channel: Channel, arm: Link | Listener | None) -> None:
         """A link is open and not started."""
@@ -142,7 +142,7 @@ class DriveLoop:
             self._keep()
         else:
             self._channel.flush()
-            self._channel.wait(IDLE)
+            self._channel.wait(IDLE_SECONDS)
 
     def close(self, cause: EndCause) -> None:
         """Bring the arm to its end (`armlink.link.ends`), telling the job how far that is, and close the bus."""
@@ -212,7 +212,7 @@ class DriveLoop:
         """Tell the job now and then that cycles are made, whatever call they are made in: it would take silence for a
         hang."""
         now = time.monotonic()
-        if now - self._signed >= SIGN_EVERY:
+        if now - self._signed >= SIGN_INTERVAL:
             self._signed = now
             self._channel.put(Told(0, ""))
             with contextlib.suppress(Closed):
@@ -276,11 +276,12 @@ class DriveLoop:
         self._last = Command.hold(self._link.latest_position)
 
     def _mind_silence(self, now: float) -> None:
-        if self._last is None or now - self._heard < SILENT:
+        if self._last is None or now - self._heard < SILENT_SECONDS:
             return
         if np.isin(self._last.mode, TORQUE_MODES).any():
             self._hold_here()
-            self._channel.put(Stopped(Stall(f"the job was silent for {SILENT:g} s: the joints hold where they stand")))
+            why = f"the job was silent for {SILENT_SECONDS:g} s: the joints hold where they stand"
+            self._channel.put(Stopped(Stall(why)))
 
 
 class KeptLoop(DriveLoop):
@@ -384,7 +385,7 @@ class KeptLoop(DriveLoop):
 
     def _listen(self, listener: Listener) -> None:
         end, heard = listener.clock.now() + BATCH_SECONDS, False
-        while (remaining := end - listener.clock.now()) > RESOLUTION:
+        while (remaining := end - listener.clock.now()) > CLOCK_RESOLUTION:
             sample = listener.next(remaining)
             while sample is not None:
                 heard = True
@@ -439,7 +440,7 @@ def main(number: int) -> None:
         try:
             simulated = opening.kept and is_in_process(opening.arm, opening.bus)  # it leaves its host the first place
             channel.put(LoopAnswer(0, None if simulated else prepare()))
-            sys.setswitchinterval(SWITCH)
+            sys.setswitchinterval(SWITCH_INTERVAL)
             cause = loop.run(ending)
         except Closed:
             cause = EndCause.LOST

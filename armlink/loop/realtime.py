@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 PRIORITY = 20
 """Of SCHED_FIFO: above everything ordinary, below the kernel's own threads (50)."""
-SIMULATED = 10
+SIMULATED_PRIORITY = 10
 """Of a simulated arm, which must leave its host the first place."""
 _LOCK_CURRENT, _LOCK_FUTURE = 1, 2
 

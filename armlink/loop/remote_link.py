@@ -18,16 +18,16 @@ from armlink.link.link import Link
 from armlink.link.park import park
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers, remote
-from armlink.loop.ending import TOLD_EVERY
+from armlink.loop.ending import TELL_INTERVAL
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
 
-CHUNK = 50
+CHUNK_ROWS = 50
 """Rows of one message: unpickling more would hold up a cycle."""
-ANSWER = 60.0
+ANSWER_SECONDS = 60.0
 """Longest wait for an answer of the loop [s]; starting an arm takes some seconds."""
-SAMPLE = 5.0
+SAMPLE_SECONDS = 5.0
 """Longest wait for a sample of an enabled arm [s]."""
 
 
@@ -125,8 +125,8 @@ class RemoteLink(CycleProcess, RemoteControllers):
         if not len(setpoints):
             return
         number = next(numbers)
-        for begin in range(0, len(setpoints), CHUNK):
-            self._put(Play(number, setpoints[begin : begin + CHUNK]))
+        for begin in range(0, len(setpoints), CHUNK_ROWS):
+            self._put(Play(number, setpoints[begin : begin + CHUNK_ROWS]))
         yield from self._take(number, len(setpoints))
         last = setpoints.command(len(setpoints) - 1)
         self._in_force = Command(last.mode.copy(), last.torque.copy(), last.position.copy(), guard=last.guard)
@@ -160,14 +160,14 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def _next(self) -> tuple[int, int, Sample]:
         """The next cycle that was not taken yet; raises what stopped the arm, BusFault."""
-        end = time.monotonic() + SAMPLE
+        end = time.monotonic() + SAMPLE_SECONDS
         while not self._samples:
             self._raise_stopped()
             self._tell()
-            self._channel.wait(TOLD_EVERY)
+            self._channel.wait(TELL_INTERVAL)
             self._receive()
             if not self._samples and self._stopped is None and time.monotonic() > end:
-                raise BusFault(f"no cycle was made for {SAMPLE:g} s: the process that drives the arm hangs")
+                raise BusFault(f"no cycle was made for {SAMPLE_SECONDS:g} s: the process that drives the arm hangs")
         self._tell()
         id, row, content = self._samples.popleft()
         sample, self.torque_sent, self.position_sent = unpack(content)
@@ -180,7 +180,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
             raise stopped.error
 
     def _tell(self) -> None:
-        if time.monotonic() - self._told > TOLD_EVERY:
+        if time.monotonic() - self._told > TELL_INTERVAL:
             self._put(Alive())
 
     def _put(self, message: object) -> None:
@@ -217,9 +217,9 @@ class RemoteLink(CycleProcess, RemoteControllers):
     def _answer(self, number: int) -> LoopAnswer:
         self._heard = time.monotonic()
         while number not in self._answers:
-            if time.monotonic() > self._heard + ANSWER:
-                raise BusFault(f"the process that drives the arm has not answered for {ANSWER:g} s")
-            self._channel.wait(TOLD_EVERY)
+            if time.monotonic() > self._heard + ANSWER_SECONDS:
+                raise BusFault(f"the process that drives the arm has not answered for {ANSWER_SECONDS:g} s")
+            self._channel.wait(TELL_INTERVAL)
             self._receive()
         return self._answers.pop(number)
 

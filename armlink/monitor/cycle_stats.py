@@ -14,7 +14,7 @@ from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
 from armlink.link.joints.groups import Group
 
-KEPT = 1_000_000
+KEPT_CYCLES = 1_000_000
 """Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""
 EDGES_MS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0, 20.0, 50.0, 100.0)
 """Upper edges of the histogram's bins [ms]; the last bin is open."""
@@ -77,7 +77,7 @@ class CycleStats:
             lost = max(0, round(period / self._period) - 1)
             self._cycles += 1
             self._missed += lost + bool(self._waiting)
-            if len(self._periods) < KEPT:
+            if len(self._periods) < KEPT_CYCLES:
                 self._periods.append(period)
                 if not self._waiting:
                     self._latencies.append(self._last - self._sync)

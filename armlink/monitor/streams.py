@@ -17,7 +17,7 @@ from armlink.recording.wrench_bag import TOPICS, external_encoder
 
 QUANTITIES = {"position": "rad", "velocity": "rad_per_s", "torque": "newton_metres", "motor_torque": "newton_metres"}
 """Reading → its unit, as a folder in the viewer."""
-PATIENCE = 2.0
+VIEWER_SECONDS = 2.0
 """Time to find out whether a viewer is there [s]."""
 
 
@@ -106,7 +106,7 @@ class RerunStream:
         require_extra("--rerun", "rerun")
         rerun: Any = import_module("rerun")
         try:
-            socket.create_connection(("127.0.0.1", port), PATIENCE).close()
+            socket.create_connection(("127.0.0.1", port), VIEWER_SECONDS).close()
         except OSError as error:
             raise BadInput(
                 f"--rerun {port}: there is no viewer on this port ({error}): start a viewer with rerun --port {port}"

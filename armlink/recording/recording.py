@@ -27,7 +27,7 @@ MOST_COLUMNS = 1000
 """Likewise of more columns, whatever they hold."""
 MOST_BYTES = 2 << 30
 """Likewise of more content than this once unpacked, as 64-bit numbers: some 9 hours of seven joints at 250 Hz."""
-PIECE = 1 << 24
+PIECE_BYTES = 1 << 24
 """Bytes that are unpacked at a time."""
 TORQUE_CHANNELS = ("torque", "motor_torque", "torque_command")
 

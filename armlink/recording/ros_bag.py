@@ -19,10 +19,10 @@ from zstandard import ZstdDecompressor, ZstdError
 from armlink.content.file_content import parse_yaml, read_whole
 from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.joint_messages import STATES, TOPICS, JointMessage, left_out, main_joints, recording_of_messages
-from armlink.recording.recording import PIECE, Recording, require_size
+from armlink.recording.recording import PIECE_BYTES, Recording, require_size
 from armlink.recording.ros_joint_state import NANO
 
-BESIDES = TOPICS.keys() - {STATES}
+SIDE_TOPICS = TOPICS.keys() - {STATES}
 """Topics beside the states."""
 MOST_WINDOW = 1 << 27
 """Window of zstd [bytes]: what its own command allows without `--long`."""
@@ -46,7 +46,7 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[JointMessage]] = defaultdict(list)
             size = 0
-            wanted = [*states, *(c for c in readable if c.topic in BESIDES and c not in states)]
+            wanted = [*states, *(c for c in readable if c.topic in SIDE_TOPICS and c not in states)]
             for connection, receipt, raw in reader.messages(connections=wanted):
                 size += len(raw)
                 require_size(size, str(path))
@@ -79,7 +79,7 @@ def _require_room(path: Path) -> None:
         try:
             unpacker = ZstdDecompressor(max_window_size=MOST_WINDOW)
             with each.open("rb") as packed, unpacker.stream_reader(packed, read_across_frames=True) as stream:
-                while piece := stream.read(PIECE):
+                while piece := stream.read(PIECE_BYTES):
                     size += len(piece)
                     require_size(size, str(each))
         except (ZstdError, OSError) as error:
@@ -87,7 +87,7 @@ def _require_room(path: Path) -> None:
 
 
 def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterable[Any], path: Path) -> list[Any]:
-    topics = sorted({c.topic for c in readable if c.topic not in BESIDES})
+    topics = sorted({c.topic for c in readable if c.topic not in SIDE_TOPICS})
     if topic and topic not in topics:
         known = ", ".join(topics) or ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in all_of_them})) or "nothing"
         raise BadInput(f"{path}: no joint states on --topic {topic}: the bag has {known}")

@@ -16,7 +16,7 @@ from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
 from armlink.recording.csv_text import CsvLayout, is_number, layout_of, read_numbers, write_numbers
 from armlink.recording.recording import (
-    PIECE,
+    PIECE_BYTES,
     Recording,
     channel_column,
     channels_of,
@@ -143,7 +143,7 @@ def _unpacked(packed: bytes, source: str) -> tuple[bytearray, bool]:
     while packed:
         member = zlib.decompressobj(wbits=31)
         while packed and not member.eof:
-            content += member.decompress(packed, PIECE)
+            content += member.decompress(packed, PIECE_BYTES)
             packed = member.unconsumed_tail
             require_size(len(content), source)
             if len(content) > _SURELY_MUCH and len(content) > _MOST_RATIO * whole:

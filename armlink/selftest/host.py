@@ -36,7 +36,7 @@ from armlink.loop.realtime import Realtime, prepare
 
 RATES = (1000.0, 800.0, 500.0, 400.0, 250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20.0, 10.0)
 """Rates that are tried on what was measured [Hz]."""
-HELD = 0.5
+LATE_SHARE = 0.5
 """A rate is held if 99.9 % of the cycles begin within this share of its period."""
 
 
@@ -62,7 +62,7 @@ class HostReport:
     def holds_hz(self) -> float:
         """Highest of RATES that this machine holds under this load; 0 if none."""
         late = self.lateness.percentile(0.999)
-        return next((rate for rate in RATES if late <= HELD / rate and self.busy <= HELD / rate), 0.0)
+        return next((rate for rate in RATES if late <= LATE_SHARE / rate and self.busy <= LATE_SHARE / rate), 0.0)
 
 
 class EchoDrives(BasicDrives[DriveMemory]):

@@ -18,15 +18,15 @@ from armlink.link.park import TELL_SECONDS, speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
 from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather, judge
 
-REACH = 0.35
+MOTION_REACH = 0.35
 """Distance by which this host moves every joint to both sides [rad]."""
-SPEED = 0.6
+MOTION_SPEED = 0.6
 """At most [rad/s]."""
 CLEARANCE = 0.05
 """Distance that this host keeps from a stop [rad]."""
 REST_SECONDS = 0.6
 """Rest at both ends of the motion [s]."""
-ASKED = 3
+CURRENT_READINGS = 3
 """Currents that are asked for at each end."""
 
 
@@ -102,12 +102,12 @@ def by_moving(link: Link, tell: Tell) -> list[JointScales]:
     least, most = ranges[:, 0] + CLEARANCE, ranges[:, 1] - CLEARANCE
     pairs: dict[int, list[tuple[float, float]]] = {joint: [] for joint in range(link.n)}
     for side in (1.0, -1.0, 0.0):
-        goal = np.clip(start + side * REACH, np.minimum(least, start), np.maximum(most, start))
+        goal = np.clip(start + side * MOTION_REACH, np.minimum(least, start), np.maximum(most, start))
         tell(
-            f"moving all joints by {REACH} rad to "
+            f"moving all joints by {MOTION_REACH} rad to "
             f"{'the upper side' if side > 0 else 'the lower side' if side else 'their first position'}"
         )
-        path = straight(link.position_sent, goal, speeds(link, SPEED), link.period)
+        path = straight(link.position_sent, goal, speeds(link, MOTION_SPEED), link.period)
         rest = np.tile(goal, (max(1, round(REST_SECONDS / link.period)), 1))
         with closing(link.play(Setpoints.follow(np.vstack([path, rest])))) as samples:
             for sample in samples:
@@ -144,7 +144,7 @@ def _ways(source: Link | Listener) -> list[float]:
 def _currents(link: Link, joint: int) -> list[tuple[float, float]]:
     """Torque as reported and by current, a few times; nothing of a drive that does not tell its current."""
     group, number = by_joint(link.groups)[joint]
-    found = [group.drives.torque_by_current(number, link.ask.on(group.tag)) for _ in range(ASKED)]
+    found = [group.drives.torque_by_current(number, link.ask.on(group.tag)) for _ in range(CURRENT_READINGS)]
     return [each for each in found if each is not None]
 
 

@@ -47,15 +47,15 @@ class ScaleTrack:
 
 
 QUANTITIES = ("position", "velocity", "torque")
-OFF = math.log(1.06)
+SCALE_TOLERANCE = math.log(1.06)
 """Scales closer than this to 1 are sound: with what ratios scatter, ten per cent are found and sound ones are not."""
-FLOOR = 0.012
+RATIO_SIGMA = 0.012
 """Least standard deviation of the logarithm of a ratio: delays, rounding, friction."""
-DAMPING_FLOOR = 0.05
+DAMPING_SIGMA = 0.05
 """The same of the damping that torque follows: it is found 10 % off where the position of its joint is; a choice."""
-PRICE = 16.0
+SCALE_PRICE = 16.0
 """A further scale must explain this much of the sum of squares."""
-RIVAL = 4.0
+RIVAL_MARGIN = 4.0
 """Explanations of as many scales within this much of the best cannot be told apart."""
 WINDOW = 0.25
 """Velocity is integrated over windows of this length [s]."""
@@ -65,7 +65,7 @@ LEAST_TURN = 0.01
 """A window in which the joint turned less tells nothing [rad]."""
 LEAST_WAY = 0.3
 """All windows together must cover this much [rad]."""
-UNSTEADY = 0.25
+UNSTEADY_SCATTER = 0.25
 """Relative scatter of the windows' ratios from which a velocity is no velocity."""
 LEAST_ROWS = 200
 """Samples with gains that the law needs."""
@@ -129,14 +129,14 @@ def judge(evidence: Sequence[Evidence]) -> list[ScaleFinding]:
             if np.linalg.matrix_rank(columns) < size:
                 continue
             log_s, *_ = np.linalg.lstsq(columns, y, rcond=None)
-            if (np.abs(log_s) >= OFF).all():
+            if (np.abs(log_s) >= SCALE_TOLERANCE).all():
                 left = y - columns @ log_s
-                costs[chosen] = float(left @ left) + PRICE * size, log_s
+                costs[chosen] = float(left @ left) + SCALE_PRICE * size, log_s
     best = min(costs, key=lambda chosen: costs[chosen][0])
     if not best:
         return []
-    rivals = [each for each in costs if len(each) == len(best) and costs[each][0] <= costs[best][0] + RIVAL]
-    texts = tuple(each.text for each in evidence if abs(math.log(each.ratio)) >= OFF / 2)
+    rivals = [each for each in costs if len(each) == len(best) and costs[each][0] <= costs[best][0] + RIVAL_MARGIN]
+    texts = tuple(each.text for each in evidence if abs(math.log(each.ratio)) >= SCALE_TOLERANCE / 2)
     if len(best) == 1:
         names = tuple(QUANTITIES[each[0]] for each in rivals)
         return [ScaleFinding(names, math.exp(float(costs[best][1][0])), texts)]
@@ -167,9 +167,10 @@ def integrated(track: ScaleTrack) -> Evidence | None:
     ratio = _median(summed / turned, np.abs(turned))
     scatter = 1.483 * _median(np.abs(summed / turned - ratio), np.abs(turned))
     text = f"the velocity, integrated over {way:.2f} rad of motion, gives {ratio * way:.2f} rad"
-    if ratio <= 0 or scatter > UNSTEADY * abs(ratio):
-        return Evidence(f"{text}, scattering by {scatter / max(abs(ratio), 1e-9):.0%}", -1.0, FLOOR, {"velocity": -1})
-    sigma = max(FLOOR, scatter / abs(ratio) / math.sqrt(len(turned)))
+    if ratio <= 0 or scatter > UNSTEADY_SCATTER * abs(ratio):
+        text = f"{text}, scattering by {scatter / max(abs(ratio), 1e-9):.0%}"
+        return Evidence(text, -1.0, RATIO_SIGMA, {"velocity": -1})
+    sigma = max(RATIO_SIGMA, scatter / abs(ratio) / math.sqrt(len(turned)))
     return Evidence(text, ratio, sigma, {"position": 1, "velocity": -1})
 
 
@@ -210,8 +211,8 @@ def law(track: ScaleTrack) -> list[Evidence]:
         stiffness = replace(stiffness, sigma=math.hypot(stiffness.sigma, share * (stiffness.value - fixed.value)))
     found = []
     for name, each, exponents, floor in (
-        ("stiffness", stiffness, {"position": 1, "torque": -1}, FLOOR),
-        ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_FLOOR),
+        ("stiffness", stiffness, {"position": 1, "torque": -1}, RATIO_SIGMA),
+        ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_SIGMA),
     ):
         if each.known:
             text = f"the torque shows a {name} of {each.value:.3g} times the commanded {name}"
@@ -254,7 +255,7 @@ def between_stops(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence
     if not stop_to_stop and covered <= PAST_STOP * way:
         return None
     text = f"the joint read {covered:.2f} rad between its stops, but the arm file has {way:.2f} rad"
-    return Evidence(text, covered / way, FLOOR, {"position": -1})
+    return Evidence(text, covered / way, RATIO_SIGMA, {"position": -1})
 
 
 def against_current(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
@@ -269,4 +270,4 @@ def against_current(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
     if ratio <= 0 or sigma > LAW_SIGMA:
         return None
     text = f"the torque that it reports is {ratio:.3g} × current × torque constant"
-    return Evidence(text, ratio, max(FLOOR, sigma), {"torque": -1})
+    return Evidence(text, ratio, max(RATIO_SIGMA, sigma), {"torque": -1})

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.drives.findings import ANSWER_CYCLES, HELD, PATIENCE, Checks, Result, count_answers
+from armlink.drives.findings import ANSWER_CYCLES, HOLD_TOLERANCE, SILENCE_DEADLINES, Checks, Result, count_answers
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
@@ -21,9 +21,9 @@ from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "position", "answers", "enables and holds", "silence", "park")
 HOLD_SECONDS = 0.5
-FELL = 0.5
+FALL_LIMIT = 0.5
 """A joint whose drive falls free may move this far in the test of its silence [rad]."""
-LEAN = 0.2
+LEAN_ANGLE = 0.2
 """So far a joint is led to where gravity pulls at it, if its drive does not tell its state [rad], and within 2 s."""
 KEEPS_ON = "nothing stops this joint when its host dies: do not drive it"
 ASKED_CYCLES = 5
@@ -40,14 +40,14 @@ def announcement(arm: ArmFile) -> str:
     if not steps:
         told = "; ".join(f"{', '.join(names)}: {drive}" for drive, names in drives.items())
         steps = (
-            f"One joint after the other then gets no commands for up to {PATIENCE * deadline:.0f} ms, until its drive "
-            f"reacts. The expected reactions are: {told}. A joint whose drive does not report its state is first "
-            f"turned by {LEAN} rad."
+            f"One joint after the other then gets no commands for up to {SILENCE_DEADLINES * deadline:.0f} ms, until "
+            f"its drive reacts. The expected reactions are: {told}. A joint whose drive does not report its state is "
+            f"first turned by {LEAN_ANGLE} rad."
         )
         if any(each.silence != each.reaction(keeper) for each in traits):
             steps += (
-                f" Finally, no joint gets commands for {PATIENCE * deadline:.0f} ms: the keeper must hold every joint "
-                "whose drive continues its last command."
+                f" Finally, no joint gets commands for {SILENCE_DEADLINES * deadline:.0f} ms: the keeper must hold "
+                "every joint whose drive continues its last command."
             )
     end = "the joints hold, in quick stop"
     if not all(each.silence == "holds" for each in traits):
@@ -194,7 +194,7 @@ class SelfTest:
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start
-        on, most = [Power.ON] * link.n, HELD + self._sags()
+        on, most = [Power.ON] * link.n, HOLD_TOLERANCE + self._sags()
         sample = self._cycle(on, standing, most)
         for _ in range(self._cycles(HOLD_SECONDS)):
             sample = self._cycle(on, standing, most)
@@ -267,7 +267,7 @@ class SelfTest:
     def _keeper(self, kept: list[int]) -> None:
         """No command for any joint: does the keeper hold those whose drives would keep on with their last one?"""
         link, loop = self.link, self.link.commander.loop
-        seconds, left = PATIENCE * link.section.deadline, "; no keeper helps if the machine or a cable fails"
+        seconds, left = SILENCE_DEADLINES * link.section.deadline, "; no keeper helps if the machine or a cable fails"
         if loop.keeper is None:
             for joint in kept:
                 told = f"its drive keeps on with its last command, and no keeper is needed in a simulation{left}"
@@ -280,7 +280,8 @@ class SelfTest:
         for joint in kept:
             heard = "sent its frames" if loop.keeper.heard else "was not heard"
             told = f"its keeper {heard} within {seconds * 1e3:.0f} ms; the joint moved by {moved[joint]:.4f} rad{left}"
-            self.checks.judge(link.names[joint], "silence", loop.keeper.heard and bool(moved[joint] < HELD), told)
+            held = loop.keeper.heard and bool(moved[joint] < HOLD_TOLERANCE)
+            self.checks.judge(link.names[joint], "silence", held, told)
         link.commander.settle()
         link.commander.walk(Power.ON)
 
@@ -289,8 +290,8 @@ class SelfTest:
         link = self.link
         start = np.array(link.commander.loop.latest_position)
         goal, middle = start.copy(), (link.limits[joint].lower + link.limits[joint].upper) / 2
-        goal[joint] += LEAN if middle > start[joint] else -LEAN
-        for target in straight(start, goal, speeds(link, LEAN), link.period):
+        goal[joint] += LEAN_ANGLE if middle > start[joint] else -LEAN_ANGLE
+        for target in straight(start, goal, speeds(link, LEAN_ANGLE), link.period):
             link.cycle(Command.hold(target))
 
     def _left_alone(self, joint: int) -> tuple[Silence | None, float]:
@@ -304,15 +305,15 @@ class SelfTest:
         found, seconds = Power.ON, 0.0
         start = link.clock.now()
         try:
-            while found is Power.ON and seconds < PATIENCE * limit:
-                self._cycle(on, standing, FELL)
+            while found is Power.ON and seconds < SILENCE_DEADLINES * limit:
+                self._cycle(on, standing, FALL_LIMIT)
                 seconds = link.clock.now() - start
                 found = group.drives.power(drive)
             if found is Power.ON:  # a drive that answers commands alone is asked
                 for can_id, data in group.drives.state_request(drive):
                     loop.send(can_id | group.tag, data)
                 for _ in range(ASKED_CYCLES):
-                    self._cycle(on, standing, FELL)
+                    self._cycle(on, standing, FALL_LIMIT)
                 found = group.drives.power(drive)
             moved = float(abs(loop.latest_position - standing)[joint])
             does = None if found is Power.UNKNOWN else self._reaction(found, group.drives.lets_go(drive), moved)
@@ -329,7 +330,7 @@ class SelfTest:
             return "keeps on"
         if free:
             return "falls"
-        return "holds" if moved < HELD else "damps"
+        return "holds" if moved < HOLD_TOLERANCE else "damps"
 
     def _cycle(
         self, power: list[Power], standing: np.typing.NDArray[np.float64], most: float | np.typing.NDArray[np.float64]

@@ -58,7 +58,7 @@ def sim(
     from armlink.bus.open import open_link_bus, resolve_bus
     from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
-    from armlink.loop.realtime import SIMULATED, prepare
+    from armlink.loop.realtime import SIMULATED_PRIORITY, prepare
     from sim_bus.bus.control_pipe import ControlPipe
     from sim_bus.bus.effect_options import parse_drift, parse_effect
     from sim_bus.bus.fault_kinds import parse_fault
@@ -85,7 +85,7 @@ def sim(
         )
     endpoint = open_link_bus(bus or None, described.require_link())
     if not lockstep:
-        prepare(SIMULATED)
+        prepare(SIMULATED_PRIORITY)
     pipe = None
     try:
         pipe = None if control is None else ControlPipe(control)

@@ -22,7 +22,7 @@ from armlink.errors import BadInput, BusFault
 
 MOST_DOMAIN = 232
 """Largest domain id whose ports are below 65536 (DDSI-RTPS 2.5, 9.6.1.1)."""
-KEPT = 1000
+KEPT_MESSAGES = 1000
 """Messages that wait while nobody reads: a second of the fastest publisher."""
 
 
@@ -41,7 +41,7 @@ class RosTopic:
     def __init__(self, topic: str) -> None:
         """Raises BadInput for an impossible domain, BusFault where DDS cannot be had."""
         self._topic, self._domain = topic, _domain()
-        quality = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(KEPT))
+        quality = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(KEPT_MESSAGES))
         try:
             participant = DomainParticipant(self._domain)
             named = Topic(participant, f"rt/{topic.lstrip('/')}", RosJointState, qos=quality)
@@ -53,7 +53,7 @@ class RosTopic:
 
     def take(self) -> list[JointStateMessage]:
         try:
-            samples = self._entities[0].take(KEPT) if self._entities else []
+            samples = self._entities[0].take(KEPT_MESSAGES) if self._entities else []
         except DDSException as error:
             raise BusFault(f"bus ros2:{self._topic}: cannot read it: {error}") from None
         now = time.monotonic()

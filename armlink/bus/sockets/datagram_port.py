@@ -1,6 +1,6 @@
 """Frames as datagrams of a socket, a system call each: a call for many saves nothing that can be measured.
 
-Subclasses define the datagram: SocketCAN's frame or python-can's udp_multicast message.
+Subclasses define the datagram: SocketCAN's frame here, python-can's udp_multicast message in `multicast_port`.
 """
 
 import contextlib
@@ -14,10 +14,10 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import Any
 
-from armlink.bus.port import ERROR, Frame, InterfaceDown, Stamped
+from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame, InterfaceDown, Stamped
 from armlink.errors import BusFault
 
-FLOOD = 32
+FLOOD_FRAMES = 32
 """So many frames that came while none could be sent filled the bus: a wire of 125 kbit/s carries 45 in that time."""
 MOST_DATAGRAMS = 4096
 """Limit of datagrams read in one call, so that a flood cannot block a reader."""
@@ -33,6 +33,9 @@ _DROPS = struct.Struct("=32xI")  # the last of the numbers of SO_MEMINFO: frames
 _STAMP = struct.Struct("=qq")  # wall clock [s], [ns]
 _CONTROL = socket.CMSG_SPACE(_STAMP.size)
 _CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read within this time, or this often
+_CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
+_NEVER_FD, _ON_WIRE = ERROR | REMOTE | CLASSICAL, 0xFFFFFFFF
+_FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
 
 
 class DatagramPort(ABC):
@@ -98,9 +101,9 @@ class DatagramPort(ABC):
     def _full(self) -> BusFault:
         """Nothing could be sent for 50 ms. Where many frames came meanwhile, they had a higher priority."""
         with contextlib.suppress(BusFault):
-            while len(self._waiting) < FLOOD and (frame := self._next()) is not None:
+            while len(self._waiting) < FLOOD_FRAMES and (frame := self._next()) is not None:
                 self._waiting.append(frame)
-        if len(self._waiting) >= FLOOD:
+        if len(self._waiting) >= FLOOD_FRAMES:
             return BusFault(f"bus {self._name}: transmit queue stays full: frames of higher priority fill the bus")
         return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 
@@ -167,6 +170,33 @@ class DatagramPort(ABC):
                 seconds, nano = next(stamps, (0, 0))
                 frames.append((seconds - ahead + 1e-9 * nano, *frame))
         return in_order(frames, earliest, time.monotonic())
+
+
+class SocketPort(DatagramPort):
+    """On a raw SocketCAN socket: classical frames, or CAN FD frames with bit-rate switch."""
+
+    longest = _FD.size
+
+    def __init__(
+        self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False, stamped: bool = False
+    ) -> None:
+        """`fd`: the socket accepts CAN FD frames, and CAN FD frames are sent; the rest as of DatagramPort."""
+        super().__init__(name, raw, raw, as_node, stamped)
+        self._fd, self._receive = fd, raw.recv
+
+    def _encode(self, can_id: int, data: bytes) -> bytes:
+        layout, flags = (_FD, _FD_FLAGS) if self._fd and not can_id & _NEVER_FD else (_CLASSIC, 0)
+        return layout.pack(can_id & _ON_WIRE, len(data), flags, data)
+
+    def _take(self) -> Frame | None:
+        return self._decoded(self._receive(_FD.size, socket.MSG_DONTWAIT))
+
+    def _decoded(self, datagram: bytes, sender: Any = None) -> Frame:
+        layout = _FD if len(datagram) == _FD.size else _CLASSIC
+        if self._as_node:
+            self._fd = layout is _FD
+        can_id, length, _, data = layout.unpack(datagram)
+        return can_id, data[:length]
 
 
 def in_order(frames: list[Stamped], earliest: float, latest: float) -> list[Stamped]:

@@ -23,7 +23,7 @@ QUICK_STOP_AND_HOLD = 6
 MAX_PROFILE_VELOCITY = Entry(0x607F, 0, "I", "max profile velocity")
 MAX_MOTOR_SPEED = Entry(0x6080, 0, "I", "max motor speed")
 """Bounds that a device may have besides the objects that the link uses: no data sheet needs them."""
-COARSER = "choose a coarser unit in the device"
+COARSER_UNIT = "choose a coarser unit in the device"
 SPEED_ROUNDING = 1e-3
 """A speed in whole counts is as exact as this."""
 DISPLAY_READS = 5
@@ -292,11 +292,11 @@ def reading_ranges(
                 f"{count * fastest:.4g} rad/s, but max_velocity is {stated:.4g} rad/s: set the object to "
                 f"{math.ceil(stated / fastest)} or more, or lower max_velocity"
             )
-    ranges = [ReadingRange("position", 2**31 * unit.position, str(objects.POSITION), COARSER)]
+    ranges = [ReadingRange("position", 2**31 * unit.position, str(objects.POSITION), COARSER_UNIT)]
     if profile.has(objects.VELOCITY):
-        ranges.append(ReadingRange("velocity", 2**31 * unit.velocity, str(objects.VELOCITY), COARSER))
+        ranges.append(ReadingRange("velocity", 2**31 * unit.velocity, str(objects.VELOCITY), COARSER_UNIT))
     if profile.has(objects.MOTOR_TORQUE):
-        ranges.append(ReadingRange("torque", (2**15 - 1) * unit.torque, str(objects.MOTOR_TORQUE), COARSER))
+        ranges.append(ReadingRange("torque", (2**15 - 1) * unit.torque, str(objects.MOTOR_TORQUE), COARSER_UNIT))
     return tuple(ranges)
 
 

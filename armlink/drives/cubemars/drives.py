@@ -31,7 +31,7 @@ TRAITS = Traits(
     torque="current", calibration="host", silence="keeps on", kept="holds", bounds=(), cadence="reply", frame="11"
 )
 """Of a drive with the default keys; with a CAN timeout it lets go."""
-LISTEN = 0.1
+LISTEN_SECONDS = 0.1
 """A drive that answers another host is heard within this time [s]."""
 
 
@@ -135,7 +135,7 @@ class CubeMarsDrives(UntoldPowerDrives[CubeMarsMemory], MitDrives[CubeMarsMemory
         """Only a drive that nobody is heard to drive is asked, by what also leaves motor mode."""
         for known in self.memory:
             known.position = math.nan
-        ask.wait(lambda: all(math.isfinite(known.position) for known in self.memory), LISTEN)
+        ask.wait(lambda: all(math.isfinite(known.position) for known in self.memory), LISTEN_SECONDS)
         return super().identify(ask)
 
     def identity(self, joint: int, ask: Ask) -> DriveIdentity:

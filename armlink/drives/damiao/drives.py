@@ -36,13 +36,13 @@ RANGE_FIELDS: dict[int, str] = {
     DamiaoRegister.VELOCITY_RANGE: "velocity",
     DamiaoRegister.TORQUE_RANGE: "torque",
 }
-NOTED = (
+NOTED_REGISTERS = (
     DamiaoRegister.TORQUE_CONSTANT,
     DamiaoRegister.OVER_CURRENT,
     DamiaoRegister.LARGEST_CURRENT,
     DamiaoRegister.GEAR_RATIO,
 )
-STOPS = range(0x0D, 0x10)
+STOPPING_IDS = range(0x0D, 0x10)
 """Ids whose register requests stop a moteus controller that nobody could find, for its bus was opened without CAN FD:
 to it they write a float near 0 to its mode."""
 LARGEST_RANGE = 1e4
@@ -212,7 +212,7 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         """Off, MIT mode, deadman, both read back."""
         settings, name = self.settings[joint], self.names[joint]
         ask.send(settings.id, special(Special.DISABLE))
-        values = self._read(ask, joint, (*RANGE_FIELDS, DamiaoRegister.REPLY_ID, *NOTED))
+        values = self._read(ask, joint, (*RANGE_FIELDS, DamiaoRegister.REPLY_ID, *NOTED_REGISTERS))
         if values is None:
             raise self.silent(joint, " and its id is right")
         reply_id = values[DamiaoRegister.REPLY_ID]
@@ -333,9 +333,10 @@ def _fault_text(state: int) -> str:
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     """By register 8, the command id, of every id, then the ranges of those that answered."""
-    answers = _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in range(1, 0x100) if drive not in STOPS])
+    ids = [drive for drive in range(1, 0x100) if drive not in STOPPING_IDS]
+    answers = _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in ids])
     if answers:
-        answers += _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in STOPS])
+        answers += _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in STOPPING_IDS])
     replies = {drive: can_id for can_id, drive, _, _ in sorted(answers, key=lambda answer: answer[1])}
     commands = {drive + mode: drive for drive in replies for mode in (0, *OTHER_MODES)}
     # the answers of one that replies on a command id command the drive of that id: it is asked no more

@@ -76,7 +76,7 @@ FAULTS = {
     50: "velocity error too large",
 }
 """Fault codes of mode 1; in other modes 96 to 105 tell what limits the torque at present."""
-STOPS = {
+POWERS = {
     frames.MoteusMode.STOPPED: Power.OFF,
     frames.MoteusMode.FAULT: Power.FAULT,
     frames.MoteusMode.POSITION: Power.ON,
@@ -284,7 +284,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
 def _power(known: MoteusMemory) -> Power:
     if known.mode in STOPPED_MODES:
         return Power.STOPPED
-    return STOPS[frames.MoteusMode(known.mode)] if known.mode in STOPS else Power.READY
+    return POWERS[frames.MoteusMode(known.mode)] if known.mode in POWERS else Power.READY
 
 
 def _fault_text(known: MoteusMemory) -> str:

@@ -62,9 +62,9 @@ FROM_HOST = (
     Message.ESTOP, Message.AXIS_STATE, Message.CONTROLLER_MODE, Message.INPUT_POSITION, Message.INPUT_VELOCITY,
     Message.INPUT_TORQUE, Message.LIMITS, Message.CLEAR_ERRORS, Message.POSITION_GAIN, Message.VELOCITY_GAINS,
 )  # fmt: skip
-ASK_AGAIN = 0.25
+REPEAT_SECONDS = 0.25
 """A request that shows in no heartbeat is sent again after this time [s]."""
-PATIENCE = 0.5
+START_SECONDS = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
 MODE_FRAMES = 5
 """Cycles in which a change of the control mode is told. Nothing that the drive sends shows its mode: one frame that is
@@ -119,7 +119,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         if version is None:
             came = self.memory[joint].came
             came.discard(Message.HEARTBEAT)
-            there = ask.wait(lambda: Message.HEARTBEAT in came, PATIENCE)
+            there = ask.wait(lambda: Message.HEARTBEAT in came, START_SECONDS)
             return DriveIdentity(joint, self.settings[joint].address, there, "ODrive" if there else "")
         _, product, major, minor, *firmware, _ = (int(value) for value in version)
         text = ".".join(str(part) for part in firmware)
@@ -139,7 +139,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         """By the estimates that come by themselves."""
         for known in self.memory:
             known.came.discard(Message.ESTIMATES)
-        ask.wait(lambda: all(Message.ESTIMATES in known.came for known in self.memory), PATIENCE)
+        ask.wait(lambda: all(Message.ESTIMATES in known.came for known in self.memory), START_SECONDS)
         return [known.position if Message.ESTIMATES in known.came else math.nan for known in self.memory]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
@@ -148,7 +148,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         wanted = {Message.HEARTBEAT, Message.ESTIMATES, Message.TORQUES}
         for known in self.memory:
             known.came.clear()
-        ask.wait(lambda: all(wanted <= known.came for known in self.memory), PATIENCE)
+        ask.wait(lambda: all(wanted <= known.came for known in self.memory), START_SECONDS)
         return super().set_up(ask, limits)
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
@@ -298,7 +298,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
 
 def _may_ask(known: ODriveMemory, what: int, now: float) -> bool:
     """Whether something may be asked for: not again before the last request for it has had time to show."""
-    if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
+    if known.asked[0] == what and now - known.asked[1] < REPEAT_SECONDS:
         return False
     known.asked = (what, now)
     return True

@@ -35,7 +35,7 @@ TRAITS = Traits(
 )
 LONE_POSITIONS = 5
 """A joint with so many positions and no motion in between has left the arm's own bus: its position is of the past."""
-PATIENCE = 0.3
+START_SECONDS = 0.3
 """Longest wait for positions, which come every 5 ms, and for states [s]."""
 
 
@@ -119,9 +119,10 @@ class PiperDrives(MitDrives[PiperMemory]):
     # ---- before the cycle
 
     def _wait(self, ask: Ask) -> None:
-        for known in self.memory:
-            known.position, known.state = math.nan, None
-        ask.wait(lambda: all(each.state is not None and math.isfinite(each.position) for each in self.memory), PATIENCE)
+        known = self.memory
+        for each in known:
+            each.position, each.state = math.nan, None
+        ask.wait(lambda: all(each.state is not None and math.isfinite(each.position) for each in known), START_SECONDS)
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         self._wait(ask)

@@ -39,7 +39,7 @@ HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type
 """Frames that change something, which one host alone may send."""
 MOST_TORQUE = max(RANGES, key=lambda model: RANGES[model].torque)
 """Model with the largest torque range."""
-TOLERANCE = 1e-3
+READBACK_TOLERANCE = 1e-3
 """Relative difference between a float that was written and its reading."""
 
 
@@ -138,7 +138,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
                 f"{name}: its firmware has no parameter {int(parameter):04X}h ({parameter.name}): "
                 f"{otherwise}; update the firmware"
             )
-        if abs(found - value) > TOLERANCE * abs(value):
+        if abs(found - value) > READBACK_TOLERANCE * abs(value):
             raise BusFault(
                 f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g}, but reads "
                 f"back {found:g}: {otherwise}; update the firmware, or write it with the maker's tool"

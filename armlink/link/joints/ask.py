@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.clock import Clock
-from armlink.drives.base import ANSWER, TRIES
+from armlink.drives.base import ANSWER_TIME, TRIES
 from armlink.link.cyclic_exchange import Loop
 
 T = TypeVar("T")
@@ -26,7 +26,7 @@ class LinkAsk:
         return self if tag == self._tag else LinkAsk(self._loop, self._clock, self.wait, tag)
 
     def __call__(
-        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER, tries: int = TRIES
+        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER_TIME, tries: int = TRIES
     ) -> T | None:
         found: list[T] = []
 

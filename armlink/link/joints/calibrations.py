@@ -18,7 +18,7 @@ from armlink.link.joints.values import JointValues
 from armlink.link.types import DriveSerial
 from armlink.torque_calibration import Calibration, per_joint
 
-BLANK = Calibration(1.0, 0.0)
+BLANK_CALIBRATION = Calibration(1.0, 0.0)
 """Of a drive that was never calibrated."""
 Provider = Callable[[ArmFile], Sequence[Calibration | None]]
 log = logging.getLogger("armlink")
@@ -53,7 +53,7 @@ class Calibrations:
         traits = traits_of(self.groups)
         hosted = [joint for joint in range(self.n) if traits[joint].calibration == "host"]
         found = calibrations_by_record(self.arm) if hosted and not simulated else [None] * self.n
-        self._in_host = {joint: found[joint] or BLANK for joint in hosted}
+        self._in_host = {joint: found[joint] or BLANK_CALIBRATION for joint in hosted}
         missing = [self.names[joint] for joint in hosted if found[joint] is None]
         if missing and not simulated:
             log.warning(
@@ -76,7 +76,7 @@ class Calibrations:
         return tuple(self.names[joint] for joint, held in self._in_host.items() if held.is_blank)
 
     def _apply_host(self) -> None:
-        self.values.calibrate(per_joint([self._in_host.get(joint, BLANK) for joint in range(self.n)]))
+        self.values.calibrate(per_joint([self._in_host.get(joint, BLANK_CALIBRATION) for joint in range(self.n)]))
 
     def _ask(self, group: Group) -> LinkAsk:
         return self.ask.on(group.tag)

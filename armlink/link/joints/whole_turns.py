@@ -18,7 +18,7 @@ from armlink.arrays import Array
 from armlink.drives.findings import Result
 from armlink.drives.orders import Power
 from armlink.errors import BadInput, BusFault, Refused
-from armlink.link.gate_limits import OUTSIDE, joint_ranges, target_window
+from armlink.link.gate_limits import WINDOW_MARGIN, joint_ranges, target_window
 from armlink.link.joints.values import JointValues
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class WholeTurns:
         """`values` are those whose zeros are corrected; `stops` of every joint [rad]."""
         self._joints, self._values, self._stops = arm.require_link().joints, values, tuple(stops)
         windows = np.array([target_window(*each) for each in stops])
-        self._lower, self._upper = windows[:, 0] - OUTSIDE, windows[:, 1] + OUTSIDE
+        self._lower, self._upper = windows[:, 0] - WINDOW_MARGIN, windows[:, 1] + WINDOW_MARGIN
         """Ends of where a joint may read a position: what the gate bears under torque control."""
         self._automatic = [bool(getattr(each.settings, "turns", "") == "auto") for each in self._joints]
 

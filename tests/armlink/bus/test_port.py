@@ -16,8 +16,8 @@ from armlink.bus.message_port import MessagePort
 from armlink.bus.open import open_bus, open_link_bus
 from armlink.bus.port import BUS_SHIFT
 from armlink.bus.sockets import datagram_port
+from armlink.bus.sockets.datagram_port import SocketPort
 from armlink.bus.sockets.multicast_port import MulticastPort
-from armlink.bus.sockets.socket_port import SocketPort
 from armlink.errors import BadInput, BusFault, Stall
 
 
@@ -130,7 +130,7 @@ def test_a_queue_that_a_flood_keeps_full_is_put_down_to_it(pair, monkeypatch):
         raise OSError(errno.ENOBUFS, "No buffer space available")
 
     port._send = send
-    for _ in range(datagram_port.FLOOD):
+    for _ in range(datagram_port.FLOOD_FRAMES):
         pair.other.send(raw(0x001))
     with pytest.raises(BusFault, match="transmit queue stays full: frames of higher priority fill the bus"):
         port.send(1, b"")

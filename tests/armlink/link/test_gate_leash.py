@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from armlink.drives.orders import Order, Power
-from armlink.link.gate import LEASH, OFF, JointLimits, Seen, beyond, hold_at, pass_gate, start_from
+from armlink.link.gate import OFF, TORQUE_LIMIT_SHARE, JointLimits, Seen, beyond, hold_at, pass_gate, start_from
 
 POSITION, TORQUE = 8, 10
 LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 1.5, 3.0, 0.5, 0.1, 0.1)
-MOST = 30.0 * LEASH
+MOST = 30.0 * TORQUE_LIMIT_SHARE
 AT = Seen(0.0, 0.5, 0.0, 0.0, True)
 GAINS = replace(LIMITS, period=0.004, kp=40.0, kd=1.5)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from armlink.link.joints import calibrations
-from armlink.link.joints.calibrations import BLANK, Calibrations
+from armlink.link.joints.calibrations import BLANK_CALIBRATION, Calibrations
 from armlink.torque_calibration import Calibration
 
 FOUND = [None, None, Calibration(1.1, 0.2, record_id=7)]
@@ -25,7 +25,7 @@ def test_joints_without_a_record_and_records_without_a_serial_are_named(simulate
         _apply_host=lambda: None,
     )
     Calibrations.calibrate_host(joints, simulated)
-    assert joints._in_host == {0: BLANK, 2: BLANK if simulated else FOUND[2]}
+    assert joints._in_host == {0: BLANK_CALIBRATION, 2: BLANK_CALIBRATION if simulated else FOUND[2]}
     said = [record.getMessage() for record in caplog.records]
     if simulated:
         assert said == []

@@ -103,7 +103,7 @@ def test_a_keeper_that_ended_is_a_fault_once():
 def test_its_frames_are_told_from_those_of_another_host():
     host = Host(silence=3600.0)
     host.renew()
-    for _ in range(keeper.REMEMBERED - 1):
+    for _ in range(keeper.REMEMBERED_CYCLES - 1):
         host.renew([])
     assert host.keeper.sends(HOLD[1])
     assert host.keeper.heard

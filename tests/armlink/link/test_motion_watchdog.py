@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from armlink.link.bus_watchdog import CROWD, CROWD_PER_JOINT, CROWDED_CYCLES, EXCESS, SLOW_CYCLES, BusWatch
+from armlink.link.bus_watchdog import (
+    CROWD_FRAMES,
+    CROWD_PER_JOINT,
+    CROWDED_CYCLES,
+    EXCESS_READINGS,
+    SLOW_CYCLES,
+    BusWatch,
+)
 from armlink.link.motion_watchdog import MotionWatch
 
 PERIOD, MOST = 0.004, 1.0
@@ -122,7 +129,7 @@ def test_velocities_that_come_as_often_as_a_drive_sends_them_are_one_senders():
         if cycle % SLOW_CYCLES == 0 and cycle % 24:  # some are lost
             bus.slow(1)
     assert bus.forged is None
-    for _ in range(EXCESS + 1):  # one may be early
+    for _ in range(EXCESS_READINGS + 1):  # one may be early
         bus.slow(0)
     assert bus.forged == 0
 
@@ -135,7 +142,7 @@ def test_torques_that_come_apart_from_positions_are_one_senders_while_they_come_
         if random.random() > 0.01:
             bus.torque_alone(0)
     assert bus.forged is None
-    for _ in range(EXCESS + 1):
+    for _ in range(EXCESS_READINGS + 1):
         bus.readings[0] += 1
         bus.torque_alone(0)
         bus.torque_alone(0)
@@ -201,7 +208,7 @@ def test_a_late_host_gets_the_frames_of_the_time_that_it_took() -> None:
     """The limit of frames is one of time: what a drive sends by its own clock comes whether the host is late or not."""
     for periods in (1.0, 4.0, 10.0):
         bus = BusWatch(1)
-        most = round(periods * (CROWD_PER_JOINT + CROWD))
+        most = round(periods * (CROWD_PER_JOINT + CROWD_FRAMES))
         for _ in range(2 * CROWDED_CYCLES):
             bus.cycle_ends(most, periods)
             assert not bus.babbling
@@ -213,11 +220,12 @@ def test_a_late_host_gets_the_frames_of_the_time_that_it_took() -> None:
 
 @given(
     cycles=st.lists(st.integers(0, 500), min_size=30, max_size=200),
-    extra=st.integers(CROWD_PER_JOINT + CROWD, 20 * CROWD),
+    extra=st.integers(CROWD_PER_JOINT + CROWD_FRAMES, 20 * CROWD_FRAMES),
 )
 def test_a_backlog_is_no_flood_however_many_cycles_bring_it(cycles: list[int], extra: int) -> None:
     """What waited while host or device had no processor comes at once or little by little; a flood stays."""
-    bus, left, limit = BusWatch(1), (CROWDED_CYCLES - 1) * (CROWD_PER_JOINT + CROWD), CROWD_PER_JOINT + CROWD
+    bus, limit = BusWatch(1), CROWD_PER_JOINT + CROWD_FRAMES
+    left = (CROWDED_CYCLES - 1) * limit
     for wanted in cycles:
         more = min(wanted, left)
         left -= more

@@ -50,7 +50,7 @@ def test_more_columns_than_any_recording_has(tmp_path):
 def test_what_unpacks_to_much_more_is_unpacked_no_further(tmp_path, monkeypatch):
     path = tmp_path / "r.csv.gz"
     monkeypatch.setattr(tables, "_SURELY_MUCH", 1 << 20)
-    monkeypatch.setattr(tables, "PIECE", 1 << 16)
+    monkeypatch.setattr(tables, "PIECE_BYTES", 1 << 16)
     path.write_bytes(gzip.compress(b"t,q_1,tau_1\n" + b"0,0,0\n" * 5_000_000))
     pieces = []
     real = zlib.decompressobj

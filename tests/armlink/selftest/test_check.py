@@ -15,7 +15,7 @@ from armlink.cli import run
 from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.drives.canopen.object_dictionary import SYNC_ID
-from armlink.drives.findings import HELD, Result
+from armlink.drives.findings import HOLD_TOLERANCE, Result
 from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest, announcement
 from sim_bus.bus.lock_step import LockStepBus
@@ -298,7 +298,7 @@ def test_the_joint_that_a_reason_begins_with_is_blamed():
 
 def test_the_joint_that_moved_is_blamed(capsys, monkeypatch):
     """A shoulder that carries the arm, with gains that are not its own: no tolerance is left for its load."""
-    monkeypatch.setattr(SelfTest, "_sags", lambda test: np.full(test.link.n, -HELD))
+    monkeypatch.setattr(SelfTest, "_sags", lambda test: np.full(test.link.n, -HOLD_TOLERANCE))
     assert run(["check", "openarm", "--yes"]) == 1
     told = capsys.readouterr()
     (line,) = [line for line in told.out.splitlines() if "while it should hold" in line]

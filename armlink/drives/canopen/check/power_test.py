@@ -12,7 +12,7 @@ from armlink.drives.canopen.drives import CanopenDrives
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO2
 from armlink.drives.canopen.profile import LOST
-from armlink.drives.findings import ANSWER_CYCLES, HELD, PATIENCE, Checks, count_answers
+from armlink.drives.findings import ANSWER_CYCLES, HOLD_TOLERANCE, SILENCE_DEADLINES, Checks, count_answers
 from armlink.drives.orders import Mode, Power
 from armlink.errors import ArmlinkError, BusFault, Refused
 
@@ -107,10 +107,11 @@ class PowerTest:
             where = self.drives.known.restarted and names[min(self.drives.known.restarted)]
             raise BusFault(watch.intrusion if watch.intruder else f"{where}: its drive has restarted")
         moved = np.abs(sample.position - self._standing)
-        if (moved > HELD).any():
+        if (moved > HOLD_TOLERANCE).any():
             joint = int(np.nanargmax(moved))
-            text = f"moved by {moved[joint]:.3f} rad while it should hold (limit {HELD:g} rad), so the test was ended"
-            raise BusFault(f"{names[joint]}: {text}: check its load, its brake and its position loop")
+            text = f"moved by {moved[joint]:.3f} rad while it should hold (limit {HOLD_TOLERANCE:g} rad)"
+            remedy = "check its load, its brake and its position loop"
+            raise BusFault(f"{names[joint]}: {text}, so the test was ended: {remedy}")
         if tested is not None:
             for joint, code, _ in self.drives.known.emergencies:
                 if joint != tested:
@@ -203,7 +204,7 @@ class PowerTest:
         link, limit = self.link, self.drives.protection.deadline_ms * 1e-3
         self._progress(f"{link.names[joint]}: sending no commands for {limit * 1e3:.0f} ms")
         self.loop.withheld = frozenset([joint])
-        state, seconds = self._reaction(joint, [Power.ON] * link.n, PATIENCE * limit)
+        state, seconds = self._reaction(joint, [Power.ON] * link.n, SILENCE_DEADLINES * limit)
         self._judge(joint, "RPDO deadline", state, seconds, limit)
         self._again()
 
@@ -221,7 +222,7 @@ class PowerTest:
         start, seconds = self._last, 0.0
         after: list[tuple[DriveState, float] | None] = [None] * link.n
         pairs = list(enumerate(watching))
-        while any(watches and after[joint] is None for joint, watches in pairs) and seconds < PATIENCE * limit:
+        while any(watches and after[joint] is None for joint, watches in pairs) and seconds < SILENCE_DEADLINES * limit:
             seconds = self._cycle([Power.ON] * link.n).t - start + link.period
             for joint, each in enumerate(after):
                 left = self.drives.known.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL

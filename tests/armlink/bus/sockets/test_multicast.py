@@ -16,7 +16,7 @@ from armlink.arm_file import Bus
 from armlink.bus.message_port import as_frame
 from armlink.bus.open import open_bus
 from armlink.bus.port import ERROR, EXTENDED, REMOTE
-from armlink.bus.sockets.multicast_port import MulticastPort, message_in
+from armlink.bus.sockets.multicast_port import message_in
 
 GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000
