@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from armlink.arm_file import ArmFile, LinkJoint, LinkSection
 from armlink.drives.orders import Gains, Limits, ReadingRange
 from armlink.errors import BadInput, Refused
-from armlink.link.gate import JointLimits
+from armlink.link.gate import ROUNDING_FACTOR, JointLimits
 from armlink.model_file import compile_model
 
 POSITION_GAIN_ERROR = 0.02
@@ -22,8 +22,6 @@ sinks is caught at that speed."""
 FOLLOWING_ERROR = 0.5
 """A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
 calib takes a joint for blocked long before."""
-RANGE_ROUNDING = 1e-6
-"""Relative rounding of a range in a 32-bit float, which registers hold."""
 WINDOW_MARGIN = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
@@ -77,7 +75,7 @@ def require_ranges(
     }
     for quantity, largest, where, remedy in ranges:
         least, unit, otherwise = needed[quantity]
-        if largest < least * (1 - RANGE_ROUNDING):
+        if largest * ROUNDING_FACTOR < least:  # registers hold 32-bit floats
             raise Refused(
                 f"{name}: {where} limits the {quantity} readings to {largest:.6g} {unit}, but the gate must be "
                 f"able to read {least:.6g} {unit}: {remedy}, or {otherwise}"

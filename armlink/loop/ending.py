@@ -30,8 +30,8 @@ OF_ITS_OWN = (
 class Ending:
     """Signals to a group of processes are left to the job, which is in it: it ends this process, and says how.
 
-    A job that does not within GRACE_SECONDS after SIGTERM hangs, and this process then ends by itself. So it does when the job
-    has gone: its end of the channel may live on in a process that the job has forked.
+    A job that does not within GRACE_SECONDS after SIGTERM hangs, and this process then ends by itself. So it does when
+    the job has gone: its end of the channel may live on in a process that the job has forked.
     """
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ A cycle begins with SYNC, of drives without SYNC with the command to the first o
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,31 +18,6 @@ KEPT_CYCLES = 1_000_000
 """Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""
 EDGES_MS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0, 20.0, 50.0, 100.0)
 """Upper edges of the histogram's bins [ms]; the last bin is open."""
-
-
-@dataclass(frozen=True)
-class CycleReport:
-    """Statistics over all cycles; NaN if none was complete. Times in milliseconds."""
-
-    cycles: int
-    """Intervals from SYNC to SYNC."""
-    missed: int
-    """Cycles in which a joint's reading did not arrive before the next SYNC, or whose SYNC was missing."""
-    period_ms: float
-    jitter_ms: float
-    """Standard deviation of the period."""
-    longest_period_ms: float
-    latency_p50_ms: float
-    """Time from the start of a cycle to the last joint's reading, in complete cycles."""
-    latency_p99_ms: float
-    latency_p999_ms: float
-    latency_max_ms: float
-    histogram: tuple[tuple[float, int], ...]
-    """Upper edge of each latency bin [ms] (inf for the last) and its count; empty bins at both ends are omitted."""
-    load: float
-    """Share of the time in which frames occupied the bus, with stuff bits computed from their content."""
-    bus_ms_per_cycle: float
-    """Time that the frames of a cycle take on the wire: a lower bound for every cycle, however fast the host is."""
 
 
 class CycleStats:
@@ -87,27 +62,26 @@ class CycleStats:
         self._sync = stamp
         self._waiting = set(self._readings)
 
-    def report(self) -> CycleReport:
+    def report(self) -> dict[str, Any]:
+        """Statistics over all cycles for JSON (docs/formats.md, monitor); NaN if none was complete."""
         periods, latencies = np.array(self._periods) * 1e3, np.array(self._latencies) * 1e3
         at = np.percentile(latencies, (50, 99, 99.9, 100)).tolist() if latencies.size else [math.nan] * 4
         elapsed = self._sync - self._first
-        return CycleReport(
-            cycles=self._cycles,
-            missed=self._missed,
-            period_ms=float(periods.mean()) if periods.size else math.nan,
-            jitter_ms=float(periods.std()) if periods.size else math.nan,
-            longest_period_ms=float(periods.max()) if periods.size else math.nan,
-            latency_p50_ms=at[0],
-            latency_p99_ms=at[1],
-            latency_p999_ms=at[2],
-            latency_max_ms=at[3],
-            histogram=_histogram(latencies),
-            load=self._whole / (self._bitrate * elapsed) if elapsed > 0 else math.nan,
-            bus_ms_per_cycle=self._whole / self._bitrate * 1e3 / self._cycles if self._cycles else math.nan,
-        )
+        return {
+            "cycles": self._cycles,
+            "missed": self._missed,
+            "period_ms": float(periods.mean()) if periods.size else math.nan,
+            "jitter_ms": float(periods.std()) if periods.size else math.nan,
+            "longest_period_ms": float(periods.max()) if periods.size else math.nan,
+            **dict(zip(("latency_p50_ms", "latency_p99_ms", "latency_p999_ms", "latency_max_ms"), at, strict=True)),
+            "histogram": _histogram(latencies),
+            "load": self._whole / (self._bitrate * elapsed) if elapsed > 0 else math.nan,
+            "bus_ms_per_cycle": self._whole / self._bitrate * 1e3 / self._cycles if self._cycles else math.nan,
+        }
 
 
 def _histogram(latencies: Array) -> tuple[tuple[float, int], ...]:
+    """Upper edge of each bin [ms] (inf for the last) and its count; empty bins at both ends are omitted."""
     counts = np.bincount(np.searchsorted(EDGES_MS, latencies), minlength=len(EDGES_MS) + 1)
     bins = list(zip((*EDGES_MS, math.inf), counts.tolist(), strict=True))
     filled = [i for i, (_, count) in enumerate(bins) if count]

@@ -1,7 +1,7 @@
 """Monitor of an arm's bus: decodes what its joints send and commands nothing."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import can
@@ -92,7 +92,7 @@ class Monitor(HeardArm):
 
     def describe(self, view: View) -> dict[str, Any]:
         """A view as JSON content: joints (readings [rad, rad/s, N·m], states, age [s]), bus (rate, load), cycle."""
-        cycle = {} if self.cycle_stats is None else {"cycle": asdict(self.cycle_stats.report())}
+        cycle = {} if self.cycle_stats is None else {"cycle": self.cycle_stats.report()}
         return {
             **cycle,
             "joints": [self._joint(view.sample, joint) for joint in range(len(self.names))],

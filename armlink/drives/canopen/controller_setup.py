@@ -14,7 +14,7 @@ from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.profile import OURS, Profile, examine
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import CanopenSettings
-from armlink.drives.canopen.units import Units
+from armlink.drives.canopen.units import Units, gear_turns
 from armlink.drives.orders import Limits, Mode, ReadingRange
 from armlink.errors import BusFault, Refused
 
@@ -280,10 +280,10 @@ def reading_ranges(
 ) -> tuple[ReadingRange, ...]:
     """Ends of a device's readings by the sizes of its objects. Raises Refused where the device itself turns no faster
     than the arm file asks for: 607Fh, in units of 606Ch, and 6080h, in motor revolutions a minute."""
-    stated = limits.max_velocity
+    stated, (motor, shaft) = limits.max_velocity, gear_turns(services)
     for entry, fastest in (
         (MAX_PROFILE_VELOCITY, unit.velocity),
-        (MAX_MOTOR_SPEED, 2 * math.pi / 60 * _turns_a_motor_turn(services)),
+        (MAX_MOTOR_SPEED, 2 * math.pi / 60 * (shaft / motor)),
     ):
         count = int(services.read(entry)) if services.has(entry) else 0
         if 0 < count * fastest < stated * (1 - SPEED_ROUNDING):
@@ -298,14 +298,6 @@ def reading_ranges(
     if profile.has(objects.MOTOR_TORQUE):
         ranges.append(ReadingRange("torque", (2**15 - 1) * unit.torque, str(objects.MOTOR_TORQUE), COARSER_UNIT))
     return tuple(ranges)
-
-
-def _turns_a_motor_turn(services: NodeServices) -> float:
-    """Turns of the output for one of the motor, by 6091h; 1 where the device does not tell."""
-    if not (services.has(objects.GEAR_MOTOR) and services.has(objects.GEAR_SHAFT)):
-        return 1.0
-    motor, shaft = int(services.read(objects.GEAR_MOTOR)), int(services.read(objects.GEAR_SHAFT))
-    return shaft / motor if motor else 1.0
 
 
 def read_temperature(services: NodeServices) -> float:

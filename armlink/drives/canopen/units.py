@@ -134,7 +134,7 @@ def _position_unit(services: NodeServices) -> float | None:
     if not increments:
         return None
     turns = _optional(services, objects.ENCODER_REVOLUTIONS) or 1
-    motor, gear = _optional(services, objects.GEAR_MOTOR) or 1, _optional(services, objects.GEAR_SHAFT) or 1
+    motor, gear = gear_turns(services)
     return 2 * math.pi * turns / increments * gear / motor
 
 
@@ -147,8 +147,13 @@ def _velocity_unit(services: NodeServices, position: float) -> float:
     angle = _angle(told)
     if angle is None:
         return position / time * _power(told)
-    motor, gear = _optional(services, objects.GEAR_MOTOR) or 1, _optional(services, objects.GEAR_SHAFT) or 1
+    motor, gear = gear_turns(services)
     return angle / time * gear / motor
+
+
+def gear_turns(services: NodeServices) -> tuple[int, int]:
+    """Turns of the motor and of the output that belong together, by 6091h; 1 and 1 where the device does not tell."""
+    return _optional(services, objects.GEAR_MOTOR) or 1, _optional(services, objects.GEAR_SHAFT) or 1
 
 
 def _angle(told: int) -> float | None:

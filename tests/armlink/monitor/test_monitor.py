@@ -20,7 +20,7 @@ def test_its_own_syncs_count_once_on_a_bus_that_returns_them(arm_of, stats):
         view = monitor.watch(0.5)
         assert monitor.frames == 1 + 50  # NMT start and SYNCs
         assert view.rate_hz <= 101.0
-        assert (monitor.cycle_stats and monitor.cycle_stats.report().cycles) == (49 if stats else None)
+        assert (monitor.cycle_stats and monitor.cycle_stats.report()["cycles"]) == (49 if stats else None)
     finally:
         opened.shutdown()
 

@@ -8,6 +8,7 @@ from armlink.arm_file import LinkJoint
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
+from armlink.drives.canopen.cia402 import Control
 from armlink.drives.canopen.cyclic.wire import UINT32_MAX, check_fits
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
@@ -29,9 +30,9 @@ _ACKNOWLEDGED = 0x60
 _UPLOADED = {1: 0x4F, 2: 0x4B, 4: 0x43}
 """First byte of the answer to an SDO read, by the size of the value (CiA 301, 7.2.4.3.6)."""
 _WRITE_2_BYTES = 0x2B
-QUICK_STOP, ENABLE_OPERATION, POWER_BITS = 0x02, 0x0F, 0x0F
-"""Control words, and the bits by which one gives power: an enabled drive stays so whatever bit 7 says, which resets
-faults alone (CiA 402-2)."""
+POWER_BITS = 0x0F
+"""Bits of the control word that give power: an enabled drive stays so whatever bit 7 says, which resets faults alone
+(CiA 402-2)."""
 ROUNDING = 1
 """A target that follows a reading is this far from it at most [counts]."""
 
@@ -97,7 +98,7 @@ class NodeRules:
     @property
     def stop(self) -> tuple[int, str]:
         """The SDO write that quick-stops it, at once and without SYNC."""
-        request = bytes([_WRITE_2_BYTES]) + objects.CONTROL_WORD.address + bytes([QUICK_STOP, 0, 0, 0])
+        request = bytes([_WRITE_2_BYTES]) + objects.CONTROL_WORD.address + bytes([Control.QUICK_STOP, 0, 0, 0])
         return objects.SDO_REQUEST_ID + self.node, request.hex()
 
     @property
@@ -126,7 +127,7 @@ class NodeRules:
             power = [at for entry, at in _places(each) if entry == objects.CONTROL_WORD]
             if power:
                 code = objects.CONTROL_WORD.code
-                rule["power"] = {"at": power[0], "code": code, "mask": POWER_BITS, "value": ENABLE_OPERATION}
+                rule["power"] = {"at": power[0], "code": code, "mask": POWER_BITS, "value": int(Control.ENABLE)}
             rules[f"{each.cob_base + self.node}"] = rule
         return rules
 
