@@ -26,9 +26,9 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """A public name, loaded at first use."""
     if name in __all__:
-        from armlink.contributed import named
+        from armlink.contributed import load_contribution
 
-        if (found := named("armlink.api", name)) is not None:
+        if (found := load_contribution("armlink.api", name)) is not None:
             globals()[name] = found
             return found
     raise AttributeError(f"module 'armlink' has no attribute {name!r}; it offers {', '.join(__all__)}")

@@ -14,9 +14,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 
 from armlink.arrays import Array
 from armlink.content.file_content import MOST_TEXT, parse_yaml, read_whole
-from armlink.contributed import contributed, named
+from armlink.contributed import contributions, load_contribution
 from armlink.errors import BadInput
-from armlink.key_errors import describe, describe_all, meant
+from armlink.key_errors import describe, describe_all, suggest_key
 from armlink.names import JointName, Name
 
 SIMULATED = "armlink_sim"
@@ -131,9 +131,9 @@ def _parse_drive(keys: Any) -> Any:
 
 @cache
 def _drive_settings(family: str) -> type[Section]:
-    found = named("armlink.drives", family)
+    found = load_contribution("armlink.drives", family)
     if found is None:
-        known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
+        known = ", ".join(sorted({point.name for point in contributions("armlink.drives")}))
         raise ValueError(f"drive family {family!r} is unknown; expected one of {known}")
     settings: type[Section] = found.settings
     return settings
@@ -348,7 +348,7 @@ class ArmFile(Section):
 
 def bundled_arms() -> dict[str, Path]:
     """Names and paths of the arm files that installed packages carry (entry-point group `armlink.arms`)."""
-    folders = [files(point.value) for point in contributed("armlink.arms")]
+    folders = [files(point.value) for point in contributions("armlink.arms")]
     return {
         Path(str(entry)).stem: Path(str(entry))
         for folder in folders
@@ -389,7 +389,7 @@ def read_yaml(path: Path) -> Any:
 def _no_arm_file(path: Path) -> str:
     bundled, folder = sorted(bundled_arms()), path.parent
     beside = [str(each) for each in folder.glob("*.y*ml")] if folder.is_dir() else []
-    close = meant(str(path), [*bundled, *beside])
+    close = suggest_key(str(path), [*bundled, *beside])
     hint = close if "mean" in close else ""
     if path.is_dir():
         return f"{path} is a folder: give the path of an arm file, or a bundled arm ({', '.join(bundled)})"
@@ -402,7 +402,7 @@ def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
         raise BadInput(f"{path}: `path` is not a key of an arm file: remove it")
     content, section, model = _with_simulated_bus(dict(content), path), "", ArmFile
     try:
-        for point in contributed("armlink.sections"):
+        for point in contributions("armlink.sections"):
             if content.get(point.name) is not None:
                 section, model = point.name, point.load()
                 content[section] = model.model_validate(content[section])

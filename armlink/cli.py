@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from armlink import completion
-from armlink.content.printable_text import PrintableFormatter, printable_text, wrapped
-from armlink.contributed import contributed
+from armlink.content.printable_text import PrintableFormatter, printable_text, wrap_text
+from armlink.contributed import contributions
 from armlink.termination import terminate_as_interrupt
 
 PURPOSE = "Calibrates, watches and diagnoses robot arms, with and without torque sensors in their joints."
@@ -33,7 +33,7 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program's name) and return its exit status."""
-    points = {point.name: point for point in contributed("armlink.commands")}
+    points = {point.name: point for point in contributions("armlink.commands")}
     if not arguments or arguments[0] in ("--help", "-h"):
         sys.stdout.write(_help(points))
         return 0 if arguments else USAGE_STATUS
@@ -150,7 +150,7 @@ def _columns(stream: TextIO) -> int | None:
 def _in_terminal(stream: TextIO, line: str, indent: int = 0) -> str:
     """The line as it is shown on `stream`: broken between words where that is a terminal, then with an indent."""
     columns = _columns(stream)
-    return line if columns is None else wrapped(line, columns - indent).replace("\n", "\n" + " " * indent)
+    return line if columns is None else wrap_text(line, columns - indent).replace("\n", "\n" + " " * indent)
 
 
 def _help(points: dict[str, EntryPoint]) -> str:

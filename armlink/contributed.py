@@ -9,17 +9,17 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 
-def contributed(group: str) -> tuple[EntryPoint, ...]:
+def contributions(group: str) -> tuple[EntryPoint, ...]:
     """Entry points of a group, such as `armlink.commands`."""
-    return tuple(installed().select(group=group))
+    return tuple(installed_entry_points().select(group=group))
 
 
-def named(group: str, name: str) -> Any:
+def load_contribution(group: str, name: str) -> Any:
     """The first contribution to a group under a name, loaded; None without one."""
-    return next((point.load() for point in contributed(group) if point.name == name), None)
+    return next((point.load() for point in contributions(group) if point.name == name), None)
 
 
 @cache
-def installed() -> Any:
+def installed_entry_points() -> Any:
     """Entry points of all packages as they were at the first call."""
     return entry_points()

@@ -28,7 +28,7 @@ def describe_all(error: ValidationError, within: str = "", of: type[BaseModel] |
     return [_finding(found, within, of) for found in order]
 
 
-def meant(word: str, known: Iterable[str]) -> str:
+def suggest_key(word: str, known: Iterable[str]) -> str:
     """`; did you mean …?` where a known word is close, else `; expected one of …`."""
     words = sorted(known)
     folded = {each.casefold(): each for each in words}
@@ -47,7 +47,7 @@ def _finding(found: typing.Any, within: str, of: type[BaseModel] | None) -> tupl
         message = message.replace(old, new)
     if found["type"] == "extra_forbidden":
         known = _keys(of, [part for part in found["loc"][:-1] if isinstance(part, str)])
-        hint = meant(place[-1], known)
+        hint = suggest_key(place[-1], known)
         return key, f"unknown key{hint}" if hint else "unknown key; remove it or correct its spelling"
     if isinstance(value, dict | list | tuple | BaseModel):
         return key, message

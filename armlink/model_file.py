@@ -148,7 +148,7 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
     return ModelFile(spec, tuple(unused), unphysical, kind)
 
 
-def expanded(path: Path, out: Path) -> Path:
+def expand_xacro(path: Path, out: Path) -> Path:
     """The URDF of a xacro file, written to `out`; raises BadInput where xacro is missing or cannot expand it."""
     try:
         import xacro

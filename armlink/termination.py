@@ -75,7 +75,7 @@ class Presses:
             self.press()
 
 
-def said(name: str, presses: Presses, level: int = logging.WARNING) -> Callable[[str], None]:
+def end_logger(name: str, presses: Presses, level: int = logging.WARNING) -> Callable[[str], None]:
     """Log the end of an arm, once for each phase; raises Dropped where a person pressed twice.
 
     A text begins with its phase, up to a comma; an empty one only asks whether to go on.

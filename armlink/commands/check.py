@@ -158,16 +158,16 @@ def _judge_scales(
     from armlink.bus.open import open_link_bus
     from armlink.link.listener import Listener
     from armlink.loop.open import open_arm
-    from armlink.selftest.scale_motion import by_hand, by_listening, by_moving
+    from armlink.selftest.scale_motion import judge_by_hand, judge_by_listening, judge_by_motion
 
     with console.status("scales") as status:
         if how == "listen":
             with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
-                return by_listening(listener, status.update, seconds), str(listener.bus.channel_info)
+                return judge_by_listening(listener, status.update, seconds), str(listener.bus.channel_info)
         with open_arm(arm, bus) as link:
             if how == "hand":
-                return link.inside(by_hand, status.update, seconds), arm.name
-            return link.inside(by_moving, status.update), arm.name
+                return link.inside(judge_by_hand, status.update, seconds), arm.name
+            return link.inside(judge_by_motion, status.update), arm.name
 
 
 def _scales_answer(each: "JointScales") -> dict[str, Any]:

@@ -18,7 +18,7 @@ MOST_PARTS = 3
 """A table in more parts is worse to read than one with wrapped cells."""
 
 
-def fitted(table: Table, console: Console, options: ConsoleOptions) -> RenderableType:
+def fit_table(table: Table, console: Console, options: ConsoleOptions) -> RenderableType:
     """The table unchanged if it fits, otherwise the table with narrower columns.
 
     A title that is wider than the table becomes a line above it.
@@ -31,7 +31,7 @@ def fitted(table: Table, console: Console, options: ConsoleOptions) -> Renderabl
     if title is not None and Measurement.get(console, wide, title).maximum > min(width, options.max_width):
         table = copy.copy(table)
         table.title = None
-        return Group(title, fitted(table, console, options))
+        return Group(title, fit_table(table, console, options))
     whole = _in_width(table, console, options, whole_cells=True)
     if whole is not None:
         return whole

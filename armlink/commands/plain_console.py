@@ -21,8 +21,8 @@ from rich.status import Status
 from rich.table import Column, Table
 from rich.text import Text
 
-from armlink.commands.fitted_table import fitted
-from armlink.content.printable_text import printable_text, wrapped
+from armlink.commands.fitted_table import fit_table
+from armlink.content.printable_text import printable_text, wrap_text
 from armlink.errors import Declined
 
 PIPE_WIDTH = 10_000
@@ -64,7 +64,7 @@ class PlainConsole(Console):
         if objects and all(isinstance(each, str | Text) for each in objects):
             if self.is_terminal and not options.get("soft_wrap"):
                 sentence = Text(" ").join(_plain(each) for each in objects)
-                sentence.plain = wrapped(sentence.plain, self.width)
+                sentence.plain = wrap_text(sentence.plain, self.width)
                 objects = (sentence,)
             options = {"highlight": False, "soft_wrap": True} | options
         shown = _on_screen[-1].console if _on_screen else self
@@ -80,7 +80,7 @@ class PlainConsole(Console):
     def render(self, renderable: RenderableType, options: Any = None) -> Iterable[Segment]:
         """Segments of anything else, such as a `Text` or a table; rich's own control codes pass."""
         if isinstance(renderable, Table):
-            renderable = fitted(renderable, self, options or self.options)
+            renderable = fit_table(renderable, self, options or self.options)
         for segment in super().render(renderable, options):
             text, style, control = segment
             if control or text.isprintable() or text == "\n":
@@ -142,7 +142,7 @@ def ask(question: str, **options: Any) -> Any:
 def _wrapped_question(question: str) -> str:
     """With room for ` [y/N]: ` and the first letters of an answer behind it."""
     console, text = PlainConsole(), printable_text(question)
-    return wrapped(text, console.width - ANSWER_WIDTH) if console.is_terminal else text
+    return wrap_text(text, console.width - ANSWER_WIDTH) if console.is_terminal else text
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ def printable_text(text: str, keep: str = "") -> str:
     return "".join(escaped)
 
 
-def wrapped(text: str, width: int) -> str:
+def wrap_text(text: str, width: int) -> str:
     """A line in lines of at most `width` columns, broken between words only: some spaces become line breaks.
 
     A command in backticks, a path and anything else without a space stays whole where a line cannot hold it.
@@ -62,7 +62,7 @@ class PrintableFormatter(logging.Formatter):
         if record.exc_info:
             return printable_text(super().format(record), keep="\n")
         text = printable_text(super().format(record))
-        return text if self._width is None else wrapped(text, self._width)
+        return text if self._width is None else wrap_text(text, self._width)
 
 
 def _is_harmless(character: str) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
-from armlink.contributed import contributed, named
+from armlink.contributed import contributions, load_contribution
 from armlink.drives.base import BasicDrives
 from armlink.drives.findings import FoundDrive, FoundDrives, Result, SetupFinding
 from armlink.drives.orders import power_name
@@ -64,13 +64,13 @@ class Family:
 
 
 def family_names() -> list[str]:
-    return sorted({point.name for point in contributed(GROUP)})
+    return sorted({point.name for point in contributions(GROUP)})
 
 
 @cache
 def family(name: str) -> Family:
     """The family of this name; raises BadInput."""
-    found: Family | None = named(GROUP, name)
+    found: Family | None = load_contribution(GROUP, name)
     if found is None:
         raise BadInput(f"drive family {name!r} is unknown; expected one of {', '.join(family_names())}")
     return found

@@ -126,7 +126,7 @@ class Reading(NamedTuple):
     """Fault that the drive reports, in words with its code; empty: it reports that there is none."""
 
 
-def in_words(flags: type[IntFlag], bits: int) -> str:
+def name_flags(flags: type[IntFlag], bits: int) -> str:
     """The flags that are set in `bits`, for Reading.fault; empty where none of them is."""
     return ", ".join(str(each.name).lower().replace("_", " ") for each in flags if bits & each)
 

@@ -75,7 +75,7 @@ class UntoldPowerDrives(BasicDrives[U]):
             known.stopped = False
 
 
-def makes(torque: float, wanted: float, most: float) -> bool | None:
+def makes_torque(torque: float, wanted: float, most: float) -> bool | None:
     """Whether a drive makes a torque that it is asked for [N·m]; None where that is too little of `most` to tell."""
     if not abs(wanted) > LOAD_SHARE * most:
         return None

@@ -21,11 +21,11 @@ from armlink.link.gate import (
     Corroboration,
     JointLimits,
     Seen,
-    beyond,
-    hold_at,
+    describe_excess,
+    hold_order,
     is_fresh,
     pass_gate,
-    start_from,
+    start_order,
 )
 from armlink.link.integral import Integral
 from armlink.link.joints.groups import by_joint
@@ -172,14 +172,14 @@ class Commander:
                 position = self.passed[joint].position
             integral = self._integrals[joint]
             if integral is None:
-                order = start_from(limits, loop.latest_motor_torque[joint], position)
+                order = start_order(limits, loop.latest_motor_torque[joint], position)
             else:
                 torque = 0.0
                 if on:
                     torque = integral.update(limits, POSITION, position, 0.0, seen[joint])
                 else:
                     integral.reset()
-                order = hold_at(limits, torque, position, seen[joint])
+                order = hold_order(limits, torque, position, seen[joint])
             mode = POSITION if on or walk or wanted is Power.ON else OFF
             self.passed[joint] = order._replace(power=wanted, walk=walk, mode=mode)
         return loop.exchange(self.passed, now)
@@ -240,7 +240,7 @@ class Commander:
         self._caught.add(joint)
         if integral is not None:
             integral.reset()
-        order = hold_at(limits, 0.0, seen.position, seen)
+        order = hold_order(limits, 0.0, seen.position, seen)
         return order._replace(power=Power.ON, walk=True, mode=POSITION)
 
     def _doubt(self, joint: int, why: str, held: Order) -> None:
@@ -263,7 +263,7 @@ class Commander:
         """The order to stop a joint as its drive can, from where it is believed to stand."""
         places = (self._believed.get(joint, math.nan), seen.position, self.passed[joint].position)
         position = next(each for each in places if math.isfinite(each))
-        return start_from(self.limits[joint], seen.torque, position)._replace(power=Power.STOPPED)
+        return start_order(self.limits[joint], seen.torque, position)._replace(power=Power.STOPPED)
 
     @property
     def held(self) -> list[bool]:
@@ -393,7 +393,7 @@ class Commander:
         if passed.power is not Power.ON:
             return
         limits = self.limits[joint]
-        wrong = beyond(limits, passed, sent, self._seen_now[joint])
+        wrong = describe_excess(limits, passed, sent, self._seen_now[joint])
         if wrong:
             raise Refused(
                 f"gate: {self.names[joint]}: the frame would command {wrong}, but the limits are "

@@ -9,7 +9,7 @@ from enum import Enum
 
 from armlink.errors import BusFault, Refused, Stall
 from armlink.link.cycle import ENABLE_SECONDS
-from armlink.link.park import StowableArm, cycles, let_down, park
+from armlink.link.park import StowableArm, cycle_count, let_down, park
 from armlink.link.types import Tell
 from armlink.termination import Dropped
 
@@ -68,7 +68,7 @@ def cause_of(error: BaseException | None) -> EndCause:
     return EndCause.FAILED
 
 
-def end(link: StowableArm, cause: EndCause, tell: Tell) -> None:
+def end_work(link: StowableArm, cause: EndCause, tell: Tell) -> None:
     """Bring an arm to its end; raises nothing. `tell` may raise Dropped: the arm is then let go at once."""
     if not (link.enabled or link.held):
         return
@@ -81,7 +81,7 @@ def end(link: StowableArm, cause: EndCause, tell: Tell) -> None:
     try:
         _stow(link, tell)
     except Dropped:
-        end(link, EndCause.DROPPED, tell)
+        end_work(link, EndCause.DROPPED, tell)
     except BusFault as fault:
         link.let_go()
         with suppress(Dropped):
@@ -118,7 +118,7 @@ def _not_parked(link: StowableArm, tell: Tell) -> str:
 
 def _catch(link: StowableArm) -> None:
     """Hold the joints, those included that were let go: within what a walk to power takes at most, or not at all."""
-    for _ in range(cycles(link, ENABLE_SECONDS)):
+    for _ in range(cycle_count(link, ENABLE_SECONDS)):
         link.keep()
         if all(link.commander.held):
             break

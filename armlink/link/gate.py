@@ -179,14 +179,14 @@ def _leashed(limits: JointLimits, mode: int, torque: float, goal: float, start: 
     return Order(ON, False, mode, position, velocity, torque, kp, kd)
 
 
-def hold_at(limits: JointLimits, torque: float, position: float, seen: Seen) -> Order:
+def hold_order(limits: JointLimits, torque: float, position: float, seen: Seen) -> Order:
     """An order to hold a position that was passed before, `torque` being the torque that is produced [N·m]."""
     if limits.kp and math.isfinite(seen.position):
         return _leashed(limits, int(Mode.POSITION), torque, position, position, seen)
     return _passed(limits, torque if math.isfinite(torque) else 0.0, position, int(Mode.POSITION), ON)
 
 
-def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Order:
+def start_order(limits: JointLimits, produced_torque: float, measured_position: float) -> Order:
     """Start of the first cycle: the torque now produced [N·m], 0 if unknown, and the position [rad]."""
     torque = produced_torque if math.isfinite(produced_torque) else 0.0
     return _passed(limits, torque, measured_position, OFF, NO_POWER)
@@ -265,7 +265,7 @@ def _passed(limits: JointLimits, torque: float, position: float, mode: int, powe
     return Order(power, False, mode, position, 0.0, torque, 0.0, 0.0, refused)
 
 
-def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
+def describe_excess(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
     """The value of an order, by its bytes, that is beyond a limit, in words; empty if none. The last check of all.
 
     `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.

@@ -23,9 +23,9 @@ from armlink.link.bus_load import overload
 from armlink.link.bus_watchdog import MOST_FRAMES
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.ends import EndCause, cause_of, end
+from armlink.link.ends import EndCause, cause_of, end_work
 from armlink.link.faults import bus_fault
-from armlink.link.gate import JointLimits, start_from
+from armlink.link.gate import JointLimits, start_order
 from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges, require_ranges
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
@@ -34,9 +34,9 @@ from armlink.link.joints.groups import Group, by_joint, make_groups, traits_of
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
 from armlink.link.keeper import Keeper
-from armlink.link.park import falling, park, require_deadman
+from armlink.link.park import falling_joints, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
-from armlink.termination import Presses, said
+from armlink.termination import Presses, end_logger
 
 if TYPE_CHECKING:
     import can
@@ -133,10 +133,11 @@ class Link(Calibrations):
         """
         try:
             if tell is not None:
-                end(self, cause, tell)
-            else:
-                with Presses() as presses:
-                    end(self, cause, said(self.arm.name, presses, logging.INFO if self._lock_step else logging.WARNING))
+                end_work(self, cause, tell)
+                return
+            level = logging.INFO if self._lock_step else logging.WARNING
+            with Presses() as presses:
+                end_work(self, cause, end_logger(self.arm.name, presses, level))
         finally:
             if self._loop.keeper is not None:
                 self._loop.keeper.close()
@@ -157,7 +158,7 @@ class Link(Calibrations):
     @property
     def falls(self) -> bool:
         """Whether some drive lets go, or sinks, when its host falls silent."""
-        return bool(falling(self))
+        return bool(falling_joints(self))
 
     @property
     def addresses(self) -> list[tuple[str, str]]:
@@ -216,7 +217,7 @@ class Link(Calibrations):
         `to_enable`; BusFault, BadInput.
         """
         if self.falls:
-            end(self, EndCause.DONE, self.tell)
+            end_work(self, EndCause.DONE, self.tell)
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
@@ -283,7 +284,7 @@ class Link(Calibrations):
             ends = (at_drive.lower, at_drive.upper)
             require_ranges(self.names[joint], setup.ranges, limit, self.section.joints[joint], ends)
             torque = self.values.torque_of(joint, setup.torque)
-            passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
+            passed.append(start_order(limit, torque, self.values.position_of(joint, setup.position)))
         self.commander.begin(limits, passed, [each.modes for each in self.setups], self.position_step)
 
     @property

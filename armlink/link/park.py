@@ -68,7 +68,7 @@ class StowableArm(Protocol):
     def disable(self) -> None: ...
 
 
-def falling(link: StowableArm) -> list[str]:
+def falling_joints(link: StowableArm) -> list[str]:
     """Joints whose drives do not hold on their own when their host falls silent."""
     traits = traits_of(link.groups)
     return [name for name, each in zip(link.names, traits, strict=True) if each.silence != "holds"]
@@ -104,8 +104,8 @@ def park(link: StowableArm, tell: Tell) -> None:
     window = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
     # a joint outside its window is led back into it by the gate; one that cannot be held has no way to go
     start = np.where(link.commander.held, np.clip(link.latest_position, *window), goal)
-    path = straight(start, goal, speeds(link, stowed.speed), link.period)
-    every = cycles(link, TELL_SECONDS)
+    path = straight_path(start, goal, path_speeds(link, stowed.speed), link.period)
+    every = cycle_count(link, TELL_SECONDS)
     for row, target in enumerate(path):
         if row % every == 0:
             left = (len(path) - row) * link.period + REST_SECONDS
@@ -113,7 +113,7 @@ def park(link: StowableArm, tell: Tell) -> None:
         link.keep(target)
         how = "stopped following its target (something is in the way, or its drive is too weak)"
         _require_following(link, target, BLOCKED_LAG, how)
-    for _ in range(cycles(link, REST_SECONDS)):
+    for _ in range(cycle_count(link, REST_SECONDS)):
         link.keep(goal)
     _require_following(link, goal, POSE_TOLERANCE, "did not arrive at its parking position")
     _power_off(link)
@@ -150,11 +150,11 @@ def let_down(link: StowableArm, tell: Tell, why: str) -> None:
     from what it presses on. Raises BusFault where nothing can be sent.
     """
     target = before = link.latest_position
-    step = speeds(link, LOWERING_SPEED) * link.period
+    step = path_speeds(link, LOWERING_SPEED) * link.period
     light = LIGHT_LOAD * np.array([joint.max_torque for joint in link.section.joints])
     lower, upper = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
-    every, window = cycles(link, TELL_SECONDS), cycles(link, LOWERED_SECONDS)
-    for row in range(cycles(link, LONGEST_LOWERING)):
+    every, window = cycle_count(link, TELL_SECONDS), cycle_count(link, LOWERED_SECONDS)
+    for row in range(cycle_count(link, LONGEST_LOWERING)):
         if row % every == 0:
             tell(
                 "the arm could not be parked, so it is being lowered, which takes at most "
@@ -177,7 +177,7 @@ def let_down(link: StowableArm, tell: Tell, why: str) -> None:
     tell("the arm has been lowered, and its power is off")
 
 
-def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
+def straight_path(start: Array, goal: Array, speed: Array, period: float) -> Array:
     """Positions (K, n) [rad], one a cycle of `period` [s], from start to goal; no joint exceeds its speed [rad/s]."""
     seconds = PEAK_SPEED_RATIO * float(np.max(np.abs(goal - start) / speed, initial=0.0))
     count = max(1, math.ceil(seconds / period))
@@ -186,12 +186,12 @@ def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
     return start + way[:, None] * (goal - start)
 
 
-def speeds(link: StowableArm, speed: float) -> Array:
+def path_speeds(link: StowableArm, speed: float) -> Array:
     """The speed of a way to park, no joint beyond what it may turn at (n,) [rad/s]."""
     fastest: Array = np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
     return fastest
 
 
-def cycles(link: StowableArm, seconds: float) -> int:
+def cycle_count(link: StowableArm, seconds: float) -> int:
     """Cycles in so many seconds, at least one."""
     return max(1, round(seconds / link.period))

@@ -59,7 +59,7 @@ class Ending:
             self._asked = time.monotonic()
 
 
-def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: None) -> Callable[[str], None]:
+def job_teller(channel: Channel, aside: Callable[[Any], None] = lambda message: None) -> Callable[[str], None]:
     """Tell the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
 
     `aside` takes whatever else the job says meanwhile.

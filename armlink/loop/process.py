@@ -33,7 +33,7 @@ from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.listener import CLOCK_RESOLUTION, Listener
 from armlink.link.types import Command, Controller, Sample, Setpoints
-from armlink.loop.ending import Ending, telling
+from armlink.loop.ending import Ending, job_teller
 from armlink.loop.messages import (
     BATCH_SECONDS,
     Alive,
@@ -146,7 +146,7 @@ class DriveLoop:
 
     def close(self, cause: EndCause) -> None:
         """Bring the arm to its end (`armlink.link.ends`), telling the job how far that is, and close the bus."""
-        self._link.close(cause, telling(self._channel, self._aside.append))
+        self._link.close(cause, job_teller(self._channel, self._aside.append))
 
     def _handle(self, message: object) -> None:
         match message:
@@ -331,7 +331,7 @@ class KeptLoop(DriveLoop):
         self._begin(0)
         with contextlib.suppress(ArmlinkError, OSError):
             if isinstance(arm, Link):
-                arm.close(cause, telling(self._channel, self._aside.append))
+                arm.close(cause, job_teller(self._channel, self._aside.append))
             elif arm is not None:
                 arm.__exit__(None, None, None)
 

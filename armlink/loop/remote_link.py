@@ -21,7 +21,7 @@ from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers,
 from armlink.loop.ending import TELL_INTERVAL
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
-from armlink.termination import Presses, said
+from armlink.termination import Presses, end_logger
 
 CHUNK_ROWS = 50
 """Rows of one message: unpickling more would hold up a cycle."""
@@ -229,7 +229,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def _end(self, cause: EndCause) -> None:
         with Presses() as presses:
-            self.end(cause, said(self.arm.name, presses))
+            self.end(cause, end_logger(self.arm.name, presses))
 
 
 def _same(one: Command, other: Command) -> bool:

@@ -190,12 +190,12 @@ def _nanoseconds(cell: str, row: int, source: str) -> int:
         clock = f"{date['hour'] or '00'}:{date['minute'] or '00'}:{date['second'] or '00'}"
         ticks = int(np.datetime64(f"{date['day']}T{clock}", "ns").astype(np.int64))
     except ValueError:
-        raise no_time(cell, row, source) from None
+        raise time_error(cell, row, source) from None
     hours, minutes = int(date["zone"] or 0), int(date["zone_minute"] or 0)
     return ticks - (60 * hours + (-minutes if (date["zone"] or "").startswith("-") else minutes)) * 60_000_000_000
 
 
-def no_time(cell: object, row: int, source: str) -> BadInput:
+def time_error(cell: object, row: int, source: str) -> BadInput:
     """The refusal of a cell, in the row counted from 0, that is neither a number nor a date."""
     return BadInput(
         f"{source}: row {row + 1}: t is {cell!r}, expected a number [s] or a date such as 2026-11-24 12:00:00.25"

@@ -40,7 +40,7 @@ def main_joints(messages: Sequence[JointMessage]) -> tuple[tuple[str, ...], list
     return most, sorted({name for each in counts if not set(most) <= set(each) for name in each} - set(most))
 
 
-def left_out(joints: Sequence[str]) -> str:
+def left_out_warning(joints: Sequence[str]) -> str:
     """Warning about joints that are not read, empty if there are none."""
     return f"joints left out because they come in other messages: {', '.join(joints)}" if joints else ""
 

@@ -29,7 +29,7 @@ from armlink.recording.joint_messages import (
     TOPICS,
     JointMessage,
     Lists,
-    left_out,
+    left_out_warning,
     main_joints,
     recording_of_messages,
 )
@@ -108,7 +108,7 @@ def load_mcap(path: Path) -> Recording:
         raise BadInput(f"{path}: no {SCHEMA_NAME} on {STATES}{f'; {cut}' if cut else ''}")
     names, alone = main_joints(states)
     if alone:
-        cut = "; ".join(filter(None, (cut, left_out(alone))))
+        cut = "; ".join(filter(None, (cut, left_out_warning(alone))))
         states = [state for state in states if set(names) <= set(state.names)]
     return recording_of_messages(states, list(messages.values()), names, str(path), cut)
 

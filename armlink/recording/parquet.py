@@ -15,7 +15,7 @@ import pyarrow.parquet as pa_parquet
 from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
-from armlink.recording.csv_text import no_time
+from armlink.recording.csv_text import time_error
 from armlink.recording.recording import Recording, columns_of, is_channel, require_size, require_width
 from armlink.recording.tables import names_of_columns, recording_of_columns, renamed_header, require_each_once
 
@@ -117,7 +117,7 @@ def _seconds(column: Any, source: str) -> Array:
     if pa.types.is_float64(column.type):
         return numbers(column)
     if not pa.types.is_timestamp(column.type):
-        raise no_time(column[0].as_py() if len(column) else "", 0, source)
+        raise time_error(column[0].as_py() if len(column) else "", 0, source)
     whole = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
     ticks = np.concatenate([np.zeros(0, np.int64), *(chunk.to_numpy(zero_copy_only=False) for chunk in whole.chunks)])
     return np.asarray((ticks - ticks[:1]) * 1e-9, dtype=float)

@@ -18,7 +18,14 @@ from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.content.file_content import parse_yaml, read_whole
 from armlink.errors import ArmlinkError, BadInput
-from armlink.recording.joint_messages import STATES, TOPICS, JointMessage, left_out, main_joints, recording_of_messages
+from armlink.recording.joint_messages import (
+    STATES,
+    TOPICS,
+    JointMessage,
+    left_out_warning,
+    main_joints,
+    recording_of_messages,
+)
 from armlink.recording.recording import PIECE_BYTES, Recording, require_size
 from armlink.recording.ros_joint_state import NANO
 
@@ -63,7 +70,7 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
     by_stamp = {each.stamp: each for each in reversed(main) if set(names) <= set(each.names)}
     main = [by_stamp[stamp] for stamp in sorted(by_stamp)]
     others = [[_besides(topic, each) for each in messages] for topic, messages in samples.items()]
-    return recording_of_messages(main, others, names, str(path), left_out(alone))
+    return recording_of_messages(main, others, names, str(path), left_out_warning(alone))
 
 
 def _require_room(path: Path) -> None:

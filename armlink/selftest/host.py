@@ -24,7 +24,7 @@ from armlink.drives.traits import Traits
 from armlink.errors import BusFault
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.gate import start_from
+from armlink.link.gate import start_order
 from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.groups import Group
@@ -149,7 +149,7 @@ def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
     commander = Commander(loop, clock, arm.joint_names, period, np.inf, lock_step=False)
     setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
     gates = [gate_limits(limit) for limit in limits]
-    passed = [start_from(gate, 0.0, place) for gate, place in zip(gates, port.standing, strict=True)]
+    passed = [start_order(gate, 0.0, place) for gate, place in zip(gates, port.standing, strict=True)]
     commander.begin(gates, passed, [each.modes for each in setups], np.zeros(n))
     return commander
 

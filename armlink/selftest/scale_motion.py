@@ -14,9 +14,9 @@ from armlink.link.joints.groups import by_joint
 from armlink.link.joints.values import JointValues
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.park import TELL_SECONDS, speeds, straight
+from armlink.link.park import TELL_SECONDS, path_speeds, straight_path
 from armlink.link.types import Command, Sample, Setpoints, Tell
-from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather, judge
+from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather_evidence, judge_scales
 
 MOTION_REACH = 0.35
 """Distance by which this host moves every joint to both sides [rad]."""
@@ -68,7 +68,7 @@ def _told(order: Order | None) -> tuple[float, ...]:
     return order.position, order.velocity, order.torque, order.kp, order.kd
 
 
-def by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
+def judge_by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
     """Judge the readings while a person moves every joint from stop to stop; the drives have no power.
 
     The link is open and not started. Raises BusFault.
@@ -90,7 +90,7 @@ def by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
     return _judged(link.names, tracks, _ways(link), True, {})
 
 
-def by_moving(link: Link, tell: Tell) -> list[JointScales]:
+def judge_by_motion(link: Link, tell: Tell) -> list[JointScales]:
     """Judge the readings while this host moves all joints a little, at the place where the arm stands.
 
     The link is open and not started; in the end the joints are enabled and hold. Raises Refused, BusFault.
@@ -107,7 +107,7 @@ def by_moving(link: Link, tell: Tell) -> list[JointScales]:
             f"moving all joints by {MOTION_REACH} rad to "
             f"{'the upper side' if side > 0 else 'the lower side' if side else 'their first position'}"
         )
-        path = straight(link.position_sent, goal, speeds(link, MOTION_SPEED), link.period)
+        path = straight_path(link.position_sent, goal, path_speeds(link, MOTION_SPEED), link.period)
         rest = np.tile(goal, (max(1, round(REST_SECONDS / link.period)), 1))
         with closing(link.play(Setpoints.follow(np.vstack([path, rest])))) as samples:
             for sample in samples:
@@ -118,7 +118,7 @@ def by_moving(link: Link, tell: Tell) -> list[JointScales]:
     return _judged(link.names, tracks, _ways(link), False, pairs)
 
 
-def by_listening(listener: Listener, tell: Tell, seconds: float) -> list[JointScales]:
+def judge_by_listening(listener: Listener, tell: Tell, seconds: float) -> list[JointScales]:
     """Judge the readings while another host moves the arm; nothing is sent. Raises BusFault."""
     tracks, end, told = Tracks(listener.values, listener.n), listener.clock.now() + seconds, -np.inf
     heard = 0
@@ -157,6 +157,6 @@ def _judged(
 ) -> list[JointScales]:
     found = []
     for joint, name in enumerate(names):
-        evidence = gather(tracks.of(joint), ways[joint], stop_to_stop, pairs.get(joint, ()))
-        found.append(JointScales(name, tuple(evidence), tuple(judge(evidence))))
+        evidence = gather_evidence(tracks.of(joint), ways[joint], stop_to_stop, pairs.get(joint, ()))
+        found.append(JointScales(name, tuple(evidence), tuple(judge_scales(evidence))))
     return found

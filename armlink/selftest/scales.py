@@ -101,7 +101,7 @@ class ScaleFinding:
         return f"{what} reads {1 / self.factor:.3g} times its true value ({why})"
 
 
-def gather(
+def gather_evidence(
     track: ScaleTrack, way: float, stop_to_stop: bool, by_current: Sequence[tuple[float, float]]
 ) -> list[Evidence]:
     """All evidence of one joint.
@@ -109,11 +109,12 @@ def gather(
     `way` is the angle between its stops [rad]; `stop_to_stop`: it was moved from one to the other. `by_current` has
     pairs of a reported torque and of current times torque constant [N·m].
     """
-    found = [integrated(track), *law(track), between_stops(track, way, stop_to_stop), against_current(by_current)]
+    stops, current = stops_evidence(track, way, stop_to_stop), current_evidence(by_current)
+    found = [velocity_evidence(track), *law_evidence(track), stops, current]
     return [each for each in found if each is not None]
 
 
-def judge(evidence: Sequence[Evidence]) -> list[ScaleFinding]:
+def judge_scales(evidence: Sequence[Evidence]) -> list[ScaleFinding]:
     """The fewest scales that explain the evidence; none where all ratios are 1."""
     unsteady = [each for each in evidence if not each.ratio > 0]
     if unsteady:
@@ -146,7 +147,7 @@ def judge(evidence: Sequence[Evidence]) -> list[ScaleFinding]:
     ]
 
 
-def integrated(track: ScaleTrack) -> Evidence | None:
+def velocity_evidence(track: ScaleTrack) -> Evidence | None:
     """Velocity integrated over time against the change of position; None where the joint hardly moved."""
     both = np.isfinite(track.position) & np.isfinite(track.velocity)
     t, q, v = track.t[both], track.position[both], track.velocity[both]
@@ -186,7 +187,7 @@ def _rounding(values: Array) -> float:
     return float(steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
 
 
-def law(track: ScaleTrack) -> list[Evidence]:
+def law_evidence(track: ScaleTrack) -> list[Evidence]:
     """Torque against the law of gains, the command of the sample before with the readings of the torque's own sample;
     only coefficients that the motion shows."""
     stiff = track.kp[:-1] * (track.target[:-1] - track.position[1:])
@@ -246,7 +247,7 @@ def _coefficients(design: Array, torque: Array, rounding: Array) -> list[_Coeffi
     return found
 
 
-def between_stops(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence | None:
+def stops_evidence(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence | None:
     """The way that was covered against that between the stops; None where it tells nothing."""
     here = track.position[np.isfinite(track.position)]
     if not len(here) or not way > 0:
@@ -258,7 +259,7 @@ def between_stops(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence
     return Evidence(text, covered / way, RATIO_SIGMA, {"position": -1})
 
 
-def against_current(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
+def current_evidence(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
     """Reported torques against current times torque constant; None without any that is known."""
     known = np.array([pair for pair in pairs if all(math.isfinite(value) for value in pair)])
     if len(known) < 3 or not np.abs(known[:, 1]).max() > 0:

@@ -16,7 +16,7 @@ from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
 from armlink.link.joints.groups import by_joint, make_groups, traits_of
 from armlink.link.link import Link
-from armlink.link.park import falling, park, speeds, straight
+from armlink.link.park import falling_joints, park, path_speeds, straight_path
 from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "position", "answers", "enables and holds", "silence", "park")
@@ -221,7 +221,7 @@ class SelfTest:
     def _park(self) -> str:
         """Stow the arm where drives let go without their host; returns why it is not stowed."""
         link = self.link
-        letting_go = falling(link)
+        letting_go = falling_joints(link)
         if not letting_go:
             return "every drive holds when its host is silent"
         if link.section.park is None:
@@ -291,7 +291,7 @@ class SelfTest:
         start = np.array(link.commander.loop.latest_position)
         goal, middle = start.copy(), (link.limits[joint].lower + link.limits[joint].upper) / 2
         goal[joint] += LEAN_ANGLE if middle > start[joint] else -LEAN_ANGLE
-        for target in straight(start, goal, speeds(link, LEAN_ANGLE), link.period):
+        for target in straight_path(start, goal, path_speeds(link, LEAN_ANGLE), link.period):
             link.cycle(Command.hold(target))
 
     def _left_alone(self, joint: int) -> tuple[Silence | None, float]:

@@ -24,7 +24,7 @@ from armlink.loop.cycle_process import RemoteControllers
 from armlink.loop.kept_arm import KeptArm
 from armlink.loop.messages import BATCH_SECONDS, Down, LoopAnswer, Told
 from armlink.loop.realtime import Realtime
-from armlink.termination import Presses, said
+from armlink.termination import Presses, end_logger
 from calib.daemon.aside import in_process
 from calib.daemon.environment import CLOSING_SECONDS, Environment, Worker
 from calib.daemon.logs import log_in_thread
@@ -170,7 +170,7 @@ class Daemon:
     def _ending(self) -> Tell:
         """Takes the news, by the thread of `_bus_ends`, while the arm comes to its end: it goes to the log, and systemd
         waits."""
-        say = said(self.arm.name, self._presses)
+        say = end_logger(self.arm.name, self._presses)
 
         def tell(text: str) -> None:
             if text:
@@ -243,7 +243,7 @@ class Daemon:
         if self.process.fileno() >= 0:
             self._loop.remove_reader(self.process.fileno())
         self.service.take(Down(why))
-        process, tell = self.process, said(self.arm.name, self._presses)
+        process, tell = self.process, end_logger(self.arm.name, self._presses)
         self._bus_ends(lambda: process.close(EndCause.FAILED, tell), self._replace)
 
     def _replace(self, outcome: Exception | None) -> None:

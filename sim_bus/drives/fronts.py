@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.contributed import contributed
+from armlink.contributed import contributions
 from armlink.errors import BadInput
 from sim_bus.drives.cubemars import CubeMarsDrive
 from sim_bus.drives.damiao import DamiaoDrive
@@ -38,7 +38,7 @@ GROUP = "armlink.simulated_drives"
 
 
 def simulated_families() -> dict[str, Build]:
-    return FAMILIES | {point.name: point.load() for point in contributed(GROUP)}
+    return FAMILIES | {point.name: point.load() for point in contributions(GROUP)}
 
 
 def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Send]) -> list[tuple[str, Front]]:

@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile, load_arm
 from armlink.drives.orders import Mode
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.physics.plant import Plant
@@ -51,7 +51,7 @@ class EndsBench:
         self.link.start()
         self.link.enable()
         here = self.link.position_sent
-        for target in straight(here, self.stretched(), np.full(6, 1.0), self.link.period):
+        for target in straight_path(here, self.stretched(), np.full(6, 1.0), self.link.period):
             self.link.cycle(Command.hold(target))
         self.sim.attach_mass(MASS)
         self.hold(1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from armlink.errors import BadInput
-from armlink.model_file import compile_model, expanded, read_model
+from armlink.model_file import compile_model, expand_xacro, read_model
 
 MODEL = """<mujoco><asset>{mesh}</asset><worldbody>{geom}<body name="arm">
 <joint name="hinge" axis="0 1 0"/></body></worldbody></mujoco>"""
@@ -185,16 +185,16 @@ XACRO = """<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:
 
 def test_a_xacro_file_is_expanded(tmp_path, monkeypatch):
     (tmp_path / "two.xacro").write_text(XACRO)
-    model = compile_model(expanded(tmp_path / "two.xacro", tmp_path / "two.urdf"))
+    model = compile_model(expand_xacro(tmp_path / "two.xacro", tmp_path / "two.urdf"))
     assert model.body_mass[model.body("l1").id] == 2.0
     assert model.body_ipos[model.body("l1").id] == pytest.approx([0.2, 0, 0])
     (tmp_path / "two.xacro").write_text(XACRO.replace("0.4", "$(find somewhere)"))
     with pytest.raises(
         BadInput, match=r"xacro cannot expand it: .* need ROS: on a machine with ROS, run xacro .*two.xacro > "
     ):
-        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
+        expand_xacro(tmp_path / "two.xacro", tmp_path / "two.urdf")
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(
         BadInput, match=r"is a xacro file: install xacro \(pip install xacro\), or expand the file yourself"
     ):
-        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
+        expand_xacro(tmp_path / "two.xacro", tmp_path / "two.urdf")

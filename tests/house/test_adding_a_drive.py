@@ -36,14 +36,14 @@ def installed(tmp_path, monkeypatch):
     assert len(points) == 2
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    contributed.installed.cache_clear()
+    contributed.installed_entry_points.cache_clear()
     yield tmp_path
     import sys
 
     for module in ("acme", "acme_sim"):
         sys.modules.pop(module, None)
     family.cache_clear()
-    contributed.installed.cache_clear()
+    contributed.installed_entry_points.cache_clear()
 
 
 def test_it_is_short():

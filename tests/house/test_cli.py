@@ -24,7 +24,7 @@ def command(monkeypatch):
         module.target = target
         monkeypatch.setitem(sys.modules, "made_up_command", module)
         point = EntryPoint(name="work", value="made_up_command:target", group="armlink.commands")
-        monkeypatch.setattr(cli, "contributed", lambda group: [point])
+        monkeypatch.setattr(cli, "contributions", lambda group: [point])
 
     return register
 

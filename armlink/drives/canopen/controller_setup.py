@@ -11,7 +11,7 @@ from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, NEEDED_MO
 from armlink.drives.canopen.eds_file import expected_identity
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
-from armlink.drives.canopen.profile import OURS, Profile, examine
+from armlink.drives.canopen.profile import OURS, Profile, examine_objects
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.canopen.units import Units, gear_turns
@@ -180,9 +180,9 @@ def offered_modes(services: NodeServices) -> int:
     )
 
 
-def examined(services: NodeServices, settings: CanopenSettings) -> Profile:
+def examine_device(services: NodeServices, settings: CanopenSettings) -> Profile:
     """The profile of a device, by asking for each object and trying the modes; raises BusFault."""
-    profile = examine(services, settings)
+    profile = examine_objects(services, settings)
     if profile is OURS:
         return profile
     offered = offered_modes(services)

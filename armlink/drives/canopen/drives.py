@@ -169,7 +169,7 @@ class CanopenDrives(BasicDrives[DriveMemory]):
             device.check_identity(services, row)
         for node in self.nmt_targets():
             self.send_nmt(ask, objects.NMT_PRE_OPERATIONAL, node)
-        profiles = [device.examined(*each) for each in zip(all_services, self.settings, strict=True)]
+        profiles = [device.examine_device(*each) for each in zip(all_services, self.settings, strict=True)]
         found = [self._set_up(*each) for each in zip(range(self.m), all_services, limits, profiles, strict=True)]
         self._use([wire for wire, _ in found])
         self.cycle.restart()

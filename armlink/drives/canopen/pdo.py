@@ -92,7 +92,7 @@ def configure(services: NodeServices, pdo: Pdo, deadline_ms: int | None) -> None
             )
 
 
-def takes(services: NodeServices, pdo: Pdo) -> bool:
+def accepts_mapping(services: NodeServices, pdo: Pdo) -> bool:
     """Whether a device maps the objects of a PDO, by trying it; the PDO is left invalid."""
     invalid, *writes = mapping_writes(pdo, services.node)
     try:

@@ -126,20 +126,20 @@ def profile_of(settings: CanopenSettings) -> Profile:
     return Profile(reading=entry, torque_scale=torque.scale, torque_zero=torque.offset)
 
 
-def lacking(services: NodeServices) -> frozenset[Entry]:
+def lacking_objects(services: NodeServices) -> frozenset[Entry]:
     """Optional objects that a device does not have, by asking for each; raises BusFault where it does not answer."""
     return frozenset(entry for entry in LOST if not services.has(entry))
 
 
-def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
+def examine_objects(services: NodeServices, settings: CanopenSettings) -> Profile:
     """The profile of a device, by asking it for each object; one with our record must have them all.
 
     The node is pre-operational, so that mappings can be tried. Raises BusFault where it does not answer.
     """
     if settings.torque == "record":
         return OURS
-    absent = lacking(services)
+    absent = lacking_objects(services)
     sheet = services.remote.object_dictionary
     modes = [sheet.get_variable(entry.index, 0) for entry in (objects.MODE, objects.MODE_DISPLAY)]
-    by_pdo = all(each is None or each.pdo_mappable for each in modes) and pdo.takes(services, pdo.RPDO2)
+    by_pdo = all(each is None or each.pdo_mappable for each in modes) and pdo.accepts_mapping(services, pdo.RPDO2)
     return replace(profile_of(settings), absent=absent, modes_by_pdo=by_pdo)

@@ -24,7 +24,7 @@ from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, 
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
-from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes
+from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes_torque
 from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(
@@ -227,7 +227,7 @@ class CubeMarsDrives(UntoldPowerDrives[CubeMarsMemory], MitDrives[CubeMarsMemory
         if known.sent is None:
             return
         wanted = law_torque(known.sent, known.position, known.velocity)
-        follows = makes(torque, wanted, self.grid_of(joint).ranges.torque)
+        follows = makes_torque(torque, wanted, self.grid_of(joint).ranges.torque)
         known.lacking = min(known.lacking, now) if follows is False else math.inf
         if known.asked:
             self.answered(joint, follows)

@@ -26,7 +26,7 @@ from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Rea
 from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
-from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes
+from armlink.drives.untold_power import UntoldMemory, UntoldPowerDrives, makes_torque
 from armlink.errors import BadInput, BusFault
 
 T = TypeVar("T")
@@ -250,7 +250,7 @@ class MyActuatorDrives(UntoldPowerDrives[MyActuatorMemory]):
             temperature, current, velocity = frames.unpack_state(data)
             torque = current * self.settings[joint].constant
             if known.asked and known.limits is not None:  # the torque of before shows whether it still makes it
-                self.answered(joint, makes(torque, known.torque, known.limits.max_torque))
+                self.answered(joint, makes_torque(torque, known.torque, known.limits.max_torque))
             known.velocity, known.torque = velocity, torque
         elif command == RmdCommand.ERROR:
             temperature, known.error = frames.unpack_error(data)

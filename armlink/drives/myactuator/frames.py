@@ -9,7 +9,7 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-from armlink.drives.orders import in_words
+from armlink.drives.orders import name_flags
 
 COMMAND_ID, REPLY_ID = 0x140, 0x240
 """With the drive's id: identifiers of commands to it and of its replies."""
@@ -176,4 +176,4 @@ def timeout_command(milliseconds: int) -> bytes:
 
 def error_text(error: int) -> str:
     """Errors in words, with their number; empty: none."""
-    return f"{in_words(RmdError, error) or 'unknown'} (error {error:04X}h)" if error else ""
+    return f"{name_flags(RmdError, error) or 'unknown'} (error {error:04X}h)" if error else ""

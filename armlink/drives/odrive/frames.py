@@ -8,7 +8,7 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-from armlink.drives.orders import in_words
+from armlink.drives.orders import name_flags
 
 
 class Message(IntEnum):
@@ -131,7 +131,7 @@ def heartbeat(data: bytes) -> Heartbeat | None:
 
 
 def error_names(bits: int) -> str:
-    return in_words(AxisError, bits) or f"unknown ({bits:#x})"
+    return name_flags(AxisError, bits) or f"unknown ({bits:#x})"
 
 
 def input_position(position: float, velocity: float, torque: float) -> bytes:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from enum import IntFlag
 
 from armlink.drives.mit_packing import Grid, MitCommand, PackedField, Ranges
-from armlink.drives.orders import in_words
+from armlink.drives.orders import name_flags
 
 JOINTS = range(1, 7)
 STOP_ID, MODE_ID, TARGETS_ID, MIT_ID, ENABLE_ID, FIRMWARE_ID = 0x150, 0x151, 0x155, 0x15A, 0x471, 0x4AF
@@ -159,4 +159,4 @@ def firmware_in(pieces: Iterator[bytes]) -> str:
 def fault_text(state: int) -> str:
     """Faults in a joint's state, in words; empty: none."""
     bits = state & ~PiperState.ENABLED
-    return f"{in_words(PiperState, bits)} (state {state:02X}h)" if bits else ""
+    return f"{name_flags(PiperState, bits)} (state {state:02X}h)" if bits else ""

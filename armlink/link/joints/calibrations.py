@@ -11,7 +11,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.contributed import contributed
+from armlink.contributed import contributions
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.groups import Group, by_joint, traits_of
 from armlink.link.joints.values import JointValues
@@ -26,7 +26,7 @@ log = logging.getLogger("armlink")
 
 def calibrations_by_record(arm: ArmFile) -> list[Calibration | None]:
     """Calibrations by an arm's records, joint by joint; None where no record is in force."""
-    for point in contributed("armlink.calibrations"):
+    for point in contributions("armlink.calibrations"):
         provide: Provider = point.load()
         return list(provide(arm))
     return [None] * len(arm.require_link().joints)

@@ -102,7 +102,7 @@ def new(
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.loop.open import first_check
-    from armlink.model_file import expanded
+    from armlink.model_file import expand_xacro
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm
@@ -144,7 +144,7 @@ def new(
         raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     _require_free(out, force, interactive)
     if is_xacro:
-        model = expanded(model, out.with_suffix(".urdf"))
+        model = expand_xacro(model, out.with_suffix(".urdf"))
     if is_arm_file:
         by_ids = have_ids and not by_hand
         ask = None if by_ids else _hand(str(bus), by_hand, interactive)

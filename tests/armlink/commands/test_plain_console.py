@@ -21,7 +21,7 @@ from rich.text import Text
 
 from armlink import cli
 from armlink.commands.plain_console import PlainColumn, PlainConsole, suggest
-from armlink.content.printable_text import PrintableFormatter, printable_json, printable_text, wrapped
+from armlink.content.printable_text import PrintableFormatter, printable_json, printable_text, wrap_text
 from calib.daemon.logs import JsonFormatter
 
 COMMAND = (
@@ -110,7 +110,7 @@ def test_an_error_and_the_list_of_commands_are_broken_between_words_on_a_termina
 
 @given(st.text(st.sampled_from("ab `"), max_size=60), st.integers(1, 40))
 def test_wrapping_turns_single_spaces_into_breaks(text, width):
-    lines = wrapped(text, width).split("\n")
+    lines = wrap_text(text, width).split("\n")
     assert " ".join(lines) == text
     for line in lines:
         assert len(line) <= width or not re.search(r"^[^ `]+ +[^ `]+", line), "longer only where it cannot be broken"

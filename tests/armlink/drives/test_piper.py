@@ -21,7 +21,7 @@ from armlink.errors import BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.recording.recorder import Recorder
-from armlink.selftest.scale_motion import by_listening
+from armlink.selftest.scale_motion import judge_by_listening
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -320,6 +320,6 @@ def test_the_hidden_factor_of_four_is_found_by_listening():
     said = talk(6.0, swing)
     for firmware, found in (("S-V1.6-3", [[]] * 3), ("S-V1.8-3", [[(("torque",), 4)]] * 3)):
         with Listener(with_firmware(firmware), Tap(said)) as listener:
-            judged = by_listening(listener, lambda text: None, 6.0)[:3]
+            judged = judge_by_listening(listener, lambda text: None, 6.0)[:3]
         told = [[(one.quantities, round(1 / one.factor)) for one in joint.findings] for joint in judged]
         assert told == found

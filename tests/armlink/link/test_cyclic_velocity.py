@@ -13,7 +13,7 @@ from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, loop_gain, velocity_t
 from armlink.drives.orders import Limits, Mode
 from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command
 from armlink.selftest.self_test import SelfTest
 from sim_bus.bus.lock_step import LockStepBus
@@ -61,7 +61,7 @@ def test_it_follows_a_ramp_holds_and_obeys_no_torque(sim: SimulatedArm) -> None:
         start = link.enable().position
         goal = start + 0.3 * np.where(start > 0, -1.0, 1.0)
         late = 0.0
-        for target in straight(start, goal, np.full(6, 0.5), link.period):
+        for target in straight_path(start, goal, np.full(6, 0.5), link.period):
             sample = link.cycle(Command.hold(target))
             late = max(late, float(np.abs(sample.position - target).max()))
             fastest = max(fastest, *(abs(order.velocity) for order in link.orders_sent))

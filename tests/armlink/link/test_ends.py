@@ -17,9 +17,9 @@ from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
 from armlink.link.ends import ENDS, EndCause, cause_of
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command
-from armlink.termination import Presses, said
+from armlink.termination import Presses, end_logger
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -244,7 +244,7 @@ def test_a_pendulum_without_a_pose_is_let_down_to_where_it_hangs(caplog):
     with caplog.at_level(logging.INFO, "armlink"), Link(arm, LockStepBus(arm=sim)) as link:
         link.start()
         link.enable()
-        for target in straight(link.position_sent, np.array([0.5]), np.ones(1), link.period):
+        for target in straight_path(link.position_sent, np.array([0.5]), np.ones(1), link.period):
             link.cycle(Command.hold(target))
         for _ in range(50):
             link.cycle(Command.hold(np.array([0.5])))
@@ -303,7 +303,7 @@ def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog)
     now = [0.0]
     monkeypatch.setattr("armlink.termination.time.monotonic", lambda: now[0])
     presses = Presses()
-    tell = said("arm", presses)
+    tell = end_logger("arm", presses)
     for now[0] in (0.0, 2.5, 5.0):
         presses.press()
         tell("parking, 12 s left")
@@ -314,7 +314,7 @@ def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog)
     presses.press()
     bench = EndsBench(slow("six-damiao"))
     with caplog.at_level(logging.INFO, "armlink"):
-        bench.link.close(EndCause.INTERRUPTED, said("arm", presses))
+        bench.link.close(EndCause.INTERRUPTED, end_logger("arm", presses))
     assert all(bench.powered), "told to stop, which damps until the drives miss their host"
     bench.sim.advance(0.5)
     assert not any(bench.powered)

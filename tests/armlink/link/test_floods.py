@@ -13,7 +13,7 @@ from armlink.bus.port import EXTENDED, REMOTE, Frame
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.bus_watchdog import MOST_FRAMES, frame_name
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command, Setpoints
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.effects.quasi_direct import QuasiDirect
@@ -83,7 +83,7 @@ def flooded(family: str, kind: str, count: int) -> tuple[FloodedBus, ArmlinkErro
         with Link(arm, bus) as link:
             link.start()
             start = link.enable().position
-            way = straight(start, start + 0.3 * np.where(start > 0, -1, 1), np.full(link.n, SPEED), link.period)
+            way = straight_path(start, start + 0.3 * np.where(start > 0, -1, 1), np.full(link.n, SPEED), link.period)
             for row, _ in enumerate(link.play(Setpoints.follow(way))):
                 if row == len(way) // 4:  # breaking away is over
                     bus.fastest = 0.0

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from armlink.drives.orders import Order, Power
 from armlink.link import gate as g
-from armlink.link.gate import OFF, JointLimits, Seen, beyond, is_fresh, pass_gate, start_from
+from armlink.link.gate import OFF, JointLimits, Seen, describe_excess, is_fresh, pass_gate, start_order
 
 POSITION, TORQUE, PROFILE_POSITION, PROFILE_TORQUE = 8, 10, 1, 4
 anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -61,7 +61,7 @@ def may_pass(limits, mode, torque, position, age, held, now):
 @settings(max_examples=400, deadline=None)
 @given(limits(), st.floats(-20, 20), st.floats(-20, 20), cycles)
 def test_no_frame_exceeds_a_limit_whoever_calls(limits, torque, position, cycles):
-    held = start_from(limits, torque, position)
+    held = start_order(limits, torque, position)
     for mode, wanted_torque, wanted_position, age, now in cycles:
         passed = pass_gate(limits, mode, wanted_torque, wanted_position, age, held, now)
         assert bool(passed.refused) != may_pass(limits, mode, wanted_torque, wanted_position, age, held, now)
@@ -76,7 +76,7 @@ def test_no_frame_exceeds_a_limit_whoever_calls(limits, torque, position, cycles
             slack = 1e-12 * (1 + abs(start))
             assert abs(passed.position - start) <= limits.position_step + slack
             assert min(limits.lower, start) - slack <= passed.position <= max(limits.upper, start) + slack
-        assert not beyond(limits, passed, passed, now)
+        assert not describe_excess(limits, passed, passed, now)
         assert passed.mode == (0 if passed.refused else mode)
         stands = {True: Power.STOPPED, False: Power.ON if mode else Power.OFF}
         assert passed.power is stands[bool(passed.refused)]
@@ -84,7 +84,7 @@ def test_no_frame_exceeds_a_limit_whoever_calls(limits, torque, position, cycles
 
 
 LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 1.5, 3.0, 0.5, 0.1, 0.1)
-START = start_from(LIMITS, 8.0, 0.5)
+START = start_order(LIMITS, 8.0, 0.5)
 
 
 def gate(
@@ -127,7 +127,7 @@ def test_the_first_torque_frame_is_one_step_from_the_torque_now_produced(mode):
 def test_torque_is_clipped_at_the_limit_even_where_more_is_produced():
     assert gate(TORQUE, torque=100.0, produced=40.0).torque == 30.0
     assert gate(TORQUE, torque=-100.0, produced=-40.0).torque == -30.0
-    assert start_from(LIMITS, 99.0, 0.0).torque == 30.0
+    assert start_order(LIMITS, 99.0, 0.0).torque == 30.0
 
 
 @POSITION_MODES
@@ -142,7 +142,7 @@ def test_target_position_moves_at_the_velocity_limit(mode):
 
 @POSITION_MODES
 def test_the_window_ends_the_way(mode):
-    near = start_from(LIMITS, 0.0, 1.999)
+    near = start_order(LIMITS, 0.0, 1.999)
     assert gate(mode, position=9.0, held=near, measured=1.999).position == 2.0
     assert gate(mode, position=-9.0, measured=-1.999).position == -2.0
 
@@ -243,8 +243,8 @@ def test_a_refused_command_moves_nothing():
 
 def test_what_the_first_cycle_starts_from():
     assert Order(Power.OFF, False, OFF, 0.5, 0.0, 8.0, 0.0, 0.0) == START
-    assert start_from(LIMITS, math.nan, 0.5).torque == 0.0
-    assert start_from(LIMITS, math.inf, 0.5).torque == 0.0
+    assert start_order(LIMITS, math.nan, 0.5).torque == 0.0
+    assert start_order(LIMITS, math.inf, 0.5).torque == 0.0
 
 
 def test_freshness():

@@ -9,7 +9,7 @@ import yaml
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -32,7 +32,7 @@ def simulated(arm):
 def away(arm, link, by):
     """Move the arm off its pose."""
     goal = np.array(arm.link.park.pose) + by
-    for target in straight(link.position_sent, goal, np.full(6, 1.0), link.period):
+    for target in straight_path(link.position_sent, goal, np.full(6, 1.0), link.period):
         link.cycle(Command.hold(target))
     for _ in range(50):
         link.cycle(Command.hold(goal))

@@ -5,7 +5,7 @@ import yaml
 
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.link.link import Link
-from armlink.selftest.scale_motion import JointScales, by_hand, by_moving
+from armlink.selftest.scale_motion import JointScales, judge_by_hand, judge_by_motion
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -76,10 +76,10 @@ def judged(name: str, off: dict[int, tuple[str, float]], seed: int = 0) -> list[
         link = Link(arm, bus)
         if by_whom == "hand":
             hand = Hand(sim, seed)
-            results = by_hand(link, lambda text: None, SECONDS)
+            results = judge_by_hand(link, lambda text: None, SECONDS)
             hand.let_go()
         else:
-            results = by_moving(link, lambda text: None)
+            results = judge_by_motion(link, lambda text: None)
             link.stop()
         for names, each in zip(found, results, strict=True):
             names |= named(each)

@@ -46,7 +46,7 @@ def guard_rules(
     rules: dict[str, Any] = {"frames": shared, "stop": [], "restarts": {}}
     for row, each, limit in zip(rows, services, limits, strict=True):
         device.check_identity(each, row)
-        unit, profile = read_units(each, row), device.examined(each, row.settings)
+        unit, profile = read_units(each, row), device.examine_device(each, row.settings)
         if profile.by_velocity:
             raise BadInput(
                 f"{row.name}: its drive takes only velocities (mode 9), which do not show a guard where the joint "

@@ -20,7 +20,7 @@ from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.controller_setup import Identity, identify, identity_mismatches, refused_identity
 from armlink.drives.canopen.eds_file import bundled, expected_identity, of_joints
 from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONSE_ID
-from armlink.drives.canopen.profile import Profile, lacking
+from armlink.drives.canopen.profile import Profile, lacking_objects
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
 from armlink.drives.findings import FoundDrive, SetupFinding
@@ -51,7 +51,7 @@ def scan_bus(bus: SearchedBus, joints: Mapping[int, str], stock: Collection[int]
             identities.append(Identity(name, node, present=True, answers=found[node]))
         elif found[node]:
             services = NodeServices(network, name, node, dictionary, bus.wait)
-            lost = Profile(absent=lacking(services)).lost if node in stock else ()
+            lost = Profile(absent=lacking_objects(services)).lost if node in stock else ()
             identities.append(replace(identify(services), lost=lost))
         else:
             identities.append(Identity(name, node, present=False))

@@ -76,7 +76,7 @@ class CanopenSelfTest:
             self._calibration(services)
             return
         self.drives.send_nmt(self.link.ask, objects.NMT_PRE_OPERATIONAL, services.node)
-        profile = device.examined(services, row.settings)
+        profile = device.examine_device(services, row.settings)
         self.profiles[self.drives.rows.index(row)] = profile
         for lost in profile.lost:
             self.checks.add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)

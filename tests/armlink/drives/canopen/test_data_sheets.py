@@ -17,7 +17,7 @@ from armlink.drives.canopen.profile import profile_of
 from armlink.drives.canopen.units import read_units, unit_doubt
 from armlink.drives.orders import Mode
 from armlink.link.link import Link
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -206,7 +206,7 @@ def test_profile_modes_stand_in_where_nothing_else_is_there(written):
         assert link.setups[0].modes == {0, 1, 4, Mode.POSITION, Mode.TORQUE}
         start = link.enable().position
         displays = link.groups[0].drives.known.displays
-        for target in straight(start, start + 0.3, np.array([0.5]), link.period):
+        for target in straight_path(start, start + 0.3, np.array([0.5]), link.period):
             sample = link.cycle(Command.hold(target))
         for _ in range(250):
             sample = link.cycle(Command.hold(start + 0.3))
