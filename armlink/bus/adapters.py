@@ -1,7 +1,7 @@
 """Adapters of python-can's buses: SocketCAN and udp_multicast through their sockets, others through messages."""
 
 import logging
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING, cast
 
 import can
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class PythonCanBus:
-    """Any interface of python-can; a context manager that closes the bus."""
+    """Any interface of python-can."""
 
     clock: Clock | None = None
 
@@ -26,12 +26,6 @@ class PythonCanBus:
         """Take ownership of a python-can bus; `name` for messages, by default python-can's own."""
         self.bus = bus
         self.channel_info = name or str(bus.channel_info)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.shutdown()
 
     @property
     def fd(self) -> bool:

@@ -11,7 +11,6 @@ import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
 
 from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import CanBus
@@ -73,12 +72,6 @@ class ArmHold:
                 _held[name] = held, count - 1
             else:
                 held.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.release()
 
 
 def _holder(name: str) -> str:

@@ -1,5 +1,9 @@
 """An arm of two joints on vcan0, for processes that share one core of a user-mode kernel."""
 
+from contextlib import contextmanager
+
+from armlink.bus.open import open_bus
+
 PAIR = """
 name: pair
 kinematics:
@@ -25,3 +29,13 @@ def pair_text(deadline: float, *fastest: float | None) -> str:
     """The arm file: link.deadline [s], and max_velocity of each joint [rad/s], None where the file states none."""
     first, second = ("" if speed is None else f", max_velocity: {speed}" for speed in fastest)
     return PAIR.format(deadline=deadline, first=first, second=second)
+
+
+@contextmanager
+def opened(section):
+    """The bus of a section, until the block ends."""
+    bus = open_bus(None, section)
+    try:
+        yield bus
+    finally:
+        bus.shutdown()

@@ -52,8 +52,6 @@ class MulticastPort(DatagramPort):
 
         The rest is as of DatagramPort. Raises BusFault without a route to the group.
         """
-        self.ignored = 0
-        """Datagrams received that were no frames."""
         self._fd, self._takes_fd = fd, fd
         self._sending = sending = _connect(name, receiving.family, group, hop_limit)
         self._own = _address(sending.getsockname())
@@ -77,10 +75,7 @@ class MulticastPort(DatagramPort):
         if _address(sender) == self._own:
             return None
         message = message_in(datagram) if len(datagram) <= LONGEST else None
-        if message is None:
-            self.ignored += 1
-            return None
-        if message.is_fd and not self._takes_fd:
+        if message is None or (message.is_fd and not self._takes_fd):
             return None
         if self._as_node and not (message.is_error_frame or message.is_remote_frame):
             self._fd = message.is_fd

@@ -20,6 +20,15 @@ class RealTimeBus:
         self.channel_info = name or f"test:{os.getpid()}"
 
 
+@contextlib.contextmanager
+def held(*drives):
+    hold = ArmHold(*drives)
+    try:
+        yield
+    finally:
+        hold.release()
+
+
 def nodes(*numbers):
     return [("main", f"node {number}") for number in numbers]
 
@@ -48,9 +57,9 @@ def test_a_second_program_is_told_who_drives_the_arm(other):
     says = rf"test:\d+: node 4 is driven by python.*\(process {other.pid}, user {os.getuid()}\): stop that program"
     with pytest.raises(BusFault, match=says):
         ArmHold(RealTimeBus(), nodes(5, 4))
-    with ArmHold(RealTimeBus(), nodes(5)):  # and what was taken on the way is free again
+    with held(RealTimeBus(), nodes(5)):  # and what was taken on the way is free again
         pass
-    with ArmHold(RealTimeBus("another bus"), nodes(3, 4)):
+    with held(RealTimeBus("another bus"), nodes(3, 4)):
         pass
 
 
@@ -89,12 +98,12 @@ def test_each_node_is_held_on_its_own_bus(other):
     group = BusGroup([RealTimeBus("free bus"), RealTimeBus()], ["first", "second"])
     with pytest.raises(BusFault, match="node 4 is driven by"):
         ArmHold(group, [("first", "node 3"), ("second", "node 4")])
-    with ArmHold(group, [("first", "node 3"), ("first", "node 4")]):
+    with held(group, [("first", "node 3"), ("first", "node 4")]):
         pass
 
 
 def test_a_bus_of_this_process_is_nobody_else_s(other):
     bus = RealTimeBus()
     bus.clock = object()
-    with ArmHold(bus, nodes(3, 4)):
+    with held(bus, nodes(3, 4)):
         pass

@@ -9,11 +9,12 @@ import time
 
 import can
 import pytest
+from vcan_pair import opened
 
 from armlink.arm_file import Bus
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.message_port import MessagePort
-from armlink.bus.open import open_bus, open_link_bus
+from armlink.bus.open import open_link_bus
 from armlink.bus.port import BUS_SHIFT
 from armlink.bus.sockets import datagram_port
 from armlink.bus.sockets.datagram_port import SocketPort
@@ -186,7 +187,7 @@ def test_can_fd_frames_carry_the_bit_rate_switch(pair):
 
 def test_an_fd_bus_of_python_can_sends_fd_messages():
     with (
-        open_bus(None, Bus(interface="virtual", channel="fd", fd=True)) as bus,
+        opened(Bus(interface="virtual", channel="fd", fd=True)) as bus,
         can.Bus(interface="virtual", channel="fd", protocol=can.CanProtocol.CAN_FD) as other,
     ):
         port = bus.open_port()
@@ -238,8 +239,9 @@ def test_frames_go_to_the_bus_that_their_identifier_names_and_come_back_with_it(
 
 def test_one_bus_on_the_command_line_takes_every_joint(arm_of):
     section = arm_of(3, link={"bus": {"interface": "virtual", "channel": "a"}}).require_link()
-    with open_link_bus("virtual:b", section) as bus:
-        assert not isinstance(bus, BusGroup)
+    bus = open_link_bus("virtual:b", section)
+    assert not isinstance(bus, BusGroup)
+    bus.shutdown()
 
 
 def test_a_bus_that_is_not_there_is_named(arm_of):

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import can
 import pytest
+from vcan_pair import opened
 
 from armlink.arm_file import Bus
-from armlink.bus.open import open_bus, open_link_bus
+from armlink.bus.open import open_link_bus
 
 pytestmark = pytest.mark.vcan
 
@@ -21,7 +22,7 @@ def _a_vcan0():
 
 
 def test_a_slow_reader_knows_how_many_frames_it_lost():
-    with open_bus(None, VCAN0) as sender, open_bus(None, VCAN0) as reader:
+    with opened(VCAN0) as sender, opened(VCAN0) as reader:
         sending, reading = sender.open_port(), reader.open_port()
         sent = 0
         while sent < 400 * len(CYCLE):

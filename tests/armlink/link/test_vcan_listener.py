@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_joints import FakeBus
+from vcan_pair import opened
 
 from armlink.arm_file import Bus
 from armlink.bus.bus_group import BusGroup
@@ -37,7 +38,7 @@ def taken(listener):
 
 
 def test_cycles_that_waited_together_are_apart_as_they_were_sent(arm_of):
-    with open_bus(None, VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
+    with opened(VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
         controller, syncs = other.open_port(), []
         for cycle in range(30):
             began = time.monotonic()
@@ -86,7 +87,7 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
     nodes, done = FakeBus((1, 2)), threading.Event()
 
     def serve():
-        with open_bus(None, VCAN0) as bus:
+        with opened(VCAN0) as bus:
             port = bus.open_port()
             while not done.is_set():
                 frame = port.receive(0.05)
@@ -98,7 +99,7 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
 
     thread = threading.Thread(target=serve)
     thread.start()
-    with open_bus(None, VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
+    with opened(VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
         controller = other.open_port()
         for cycle in range(10):
             controller.send(0x80, b"")

@@ -4,6 +4,7 @@ import itertools
 import os
 import socket
 import time
+from contextlib import contextmanager
 
 import can
 import msgpack
@@ -22,9 +23,14 @@ GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000
 
 
+@contextmanager
 def open_member(fd=True, channel=GROUP):
     options = {"port": PORT} if fd else {"port": PORT, "fd": False}
-    return open_bus(None, Bus(interface="udp_multicast", channel=channel, options=options))
+    bus = open_bus(None, Bus(interface="udp_multicast", channel=channel, options=options))
+    try:
+        yield bus
+    finally:
+        bus.shutdown()
 
 
 @pytest.fixture
@@ -184,7 +190,6 @@ def test_a_classical_bus_sends_classical_frames_and_does_not_hear_fd(stock):
         stock.send(message(0x181, bytes(12), fd=True))
         stock.send(message(0x182, b"ok"))
         assert drain(port) == [(0x182, b"ok")]
-        assert port.ignored == 0
 
 
 def test_a_port_hears_what_python_can_sends(port, stock):
@@ -208,7 +213,7 @@ def test_a_port_hears_what_python_can_sends(port, stock):
         (0x7FF, b"end"),
     ]
     assert port.errors == 1
-    assert (port.ignored, port.dropped) == (0, 0)
+    assert port.dropped == 0
 
 
 def test_own_frames_are_left_out_and_equal_ones_of_others_are_not(port, stock):
@@ -274,7 +279,7 @@ def test_a_node_answers_in_frames_as_it_hears(member, stock):
     ]
 
 
-def test_datagrams_that_are_no_frames_are_ignored_and_counted(port, stock):
+def test_datagrams_that_are_no_frames_are_ignored(port, stock):
     hostile = [
         b"",
         b"\xc1",
@@ -290,11 +295,9 @@ def test_datagrams_that_are_no_frames_are_ignored_and_counted(port, stock):
             sender.sendto(datagram, (GROUP, PORT))
         stock.send(message(0x181, b"x"))
         assert drain(port) == [(0x181, b"x")]
-        assert port.ignored == len(hostile)
         for _ in range(1000):
             sender.sendto(b"flood", (GROUP, PORT))
     assert drain(port) == []
-    assert port.ignored == len(hostile) + 1000
 
 
 def test_a_full_queue_counts_what_it_lost(port):
