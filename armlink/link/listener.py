@@ -73,20 +73,29 @@ class HeardArm:
 
     def __init__(self, arm: ArmFile, bus: CanBus) -> None:
         """Nothing is heard before `listen_on`; the bus's own clock counts if it has one, else the machine's."""
-        self.arm = arm = heard_arm(arm, bus)
-        self.section = section = arm.require_link()
+        self.arm = heard = heard_arm(arm, bus)
+        self.section = section = heard.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
         self.clock: Clock = bus.clock or MonotonicClock()
         self.lock_step = bus.clock is not None
-        self.groups = make_groups(arm, bus)
-        self.values = values_of(arm, self.groups)
+        self.groups = make_groups(heard, bus)
+        self.values = values_of(heard, self.groups)
+        self.places = PlaceWatch(arm, self.values)
+        """Joints that cannot stand where they read."""
 
     def listen_on(self, port: Port, unknown: Callable[[int, bytes], None], forgets: bool = False) -> None:
         """Take the joints' frames from `port`; `unknown` gets those that no drive sends. `forgets` as ForeignHost."""
         self._loop = Loop(port, self.clock, self.groups, self.values, self.period, self.lock_step)
         self._loop.on_unknown = unknown
         self._host = ForeignHost(self.groups, self.values, forgets)
+
+    def take_sample(self, now: float) -> Sample:
+        """Readings since the last sample, as of time `now`; they are of no later one."""
+        sample = self._loop.sample(now)
+        sample.position = self.places.take(sample.position)
+        self._loop.board.drop()
+        return sample
 
 
 class Listener(HeardArm, Calibrations):
@@ -100,7 +109,6 @@ class Listener(HeardArm, Calibrations):
         self.listen_on(self._port, self._take_unknown)
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
         self.calibrate_host(simulated=self.lock_step)
-        self._places = PlaceWatch(arm, self.values)
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()
         self._sample: Sample | None = None
@@ -197,11 +205,9 @@ class Listener(HeardArm, Calibrations):
             self._loop.board.drop()
             self._since = now
         else:
-            sample = self._loop.sample(self._sync)
-            sample.position = self._places.take(sample.position)
+            sample = self.take_sample(self._sync)
             sample.t = self._sync
             self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
-            self._loop.board.drop()
             self._ready.append((sample, self._host.ended))
         self._sync = now
 

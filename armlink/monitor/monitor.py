@@ -43,7 +43,7 @@ class Monitor(HeardArm):
         if stats:
             self.cycle_stats = CycleStats(self.groups, self.period, self.section.bus.bitrate)
         self.listen_on(self._open_port(bus), self._count)
-        self._places = PlaceWatch(arm, self.values, tell=lambda text: None)  # `describe` does
+        self.places = PlaceWatch(arm, self.values, tell=lambda text: None)  # `describe` does
         self._syncs = 0
         self._counted: tuple[float, int, int] | None = None
         """Time [s], cycles and bits at the end of the last view."""
@@ -84,7 +84,7 @@ class Monitor(HeardArm):
                 pass  # what waited since the bus was opened came in another time than this
         start, syncs, bits = self._counted or (self.clock.now(), self._syncs, self._loop.bits)
         sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
-        sample.position = self._places.take(sample.position)
+        sample.position = self.places.take(sample.position)
         self._counted = (self.clock.now(), self._syncs, self._loop.bits)
         elapsed = self._counted[0] - start
         rate = (self._syncs - syncs) / elapsed
@@ -108,7 +108,7 @@ class Monitor(HeardArm):
         sends = math.isfinite(sample.position[joint])
         status = int(sample.status[joint])
         group, _ = by_joint(self.groups)[joint]
-        misplaced = self._places.found.get(joint)
+        misplaced = self.places.found.get(joint)
         return {
             "joint": self.names[joint],
             "family": group.family.name,

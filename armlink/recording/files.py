@@ -1,5 +1,6 @@
 """Loads and saves recordings by file suffix, and by folder."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,10 +52,7 @@ def _loaded(path: Path, stated: Corrections, poses: bool = False, efforts: bool 
 
         return load_lerobot(path, efforts=poses or efforts)
     if (path / "metadata.yaml").is_file() or path.suffix in (".db3", ".bag"):
-        require_extra(str(path), "bags")
-        from armlink.recording.ros_bag import load_bag
-
-        return {str(path): load_bag(path, stated.topic)}
+        return _of_bag(path, [path], stated)
     if path.is_dir():
         return _of_folder(path, stated)
     if path.suffix == ".zstd":
@@ -71,9 +69,7 @@ def _loaded(path: Path, stated: Corrections, poses: bool = False, efforts: bool 
 
         if not stated.topic and has_our_topics(path):
             return {str(path): load_mcap(path)}
-        from armlink.recording.ros_bag import load_bag
-
-        return {str(path): load_bag(path, stated.topic)}
+        return _of_bag(path, [path], stated)
     if suffix == ".parquet":
         require_extra(str(path), "parquet")
         from armlink.recording.parquet import load_parquet
@@ -93,6 +89,10 @@ def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
         raise BadInput(
             f"{path} is neither the folder of a ROS 2 bag (.mcap or .db3 files) nor a LeRobot data set (meta/info.json)"
         )
+    return _of_bag(path, files, stated)
+
+
+def _of_bag(path: Path, files: Sequence[Path], stated: Corrections) -> dict[str, Recording]:
     require_extra(str(path), "bags")
     from armlink.recording.ros_bag import load_bag
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
-from armlink.link.joints.whole_turns import PlaceWatch
 from armlink.link.listener import HeardArm
 
 WAIT_SECONDS = 0.1
@@ -21,8 +20,6 @@ class Recorder(HeardArm):
         self._timed = bus if isinstance(bus, TimedBus) else None
         self._stamp: Callable[[], float] = self._timed.stamp if self._timed else self.clock.now
         self.listen_on(bus.open_port(), self._take, forgets=True)
-        self.places = PlaceWatch(arm, self.values)
-        """Joints that cannot stand where they read."""
         self._start: float | None = None
         self._sync: float | None = None
         self._rows: list[Row] = []
@@ -41,9 +38,7 @@ class Recorder(HeardArm):
 
     def _complete(self, now: float) -> None:
         """A cycle that begins completes the row of the previous one."""
-        sample = self._loop.sample(now)
-        sample.position = self.places.take(sample.position)
-        self._loop.board.drop()
+        sample = self.take_sample(now)
         if self._sync is not None and self._start is not None:
             torque, position = self._host.decode(self._host.ended, sample)
             channels = {

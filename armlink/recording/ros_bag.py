@@ -35,15 +35,14 @@ MOST_WINDOW = 1 << 27
 """Window of zstd [bytes]: what its own command allows without `--long`."""
 
 
-def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
-    """Load a bag, or the files of one without its `metadata.yaml`: the joint states of `topic`.
+def load_bag(files: Sequence[Path], topic: str = "") -> Recording:
+    """Load a bag, its folder alone or the files of one without its `metadata.yaml`: the joint states of `topic`.
 
     By default that is `/joint_states` or the only topic that carries some.
 
     Joints are those of the most frequent message; other topics' messages go to the row nearest in time. Raises BadInput
     where the topic must be named, or nothing can be read.
     """
-    files = [path] if isinstance(path, Path) else list(path)
     path = files[0] if len(files) == 1 else files[0].parent
     for each in files:
         _require_room(each)
