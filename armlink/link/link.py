@@ -27,7 +27,6 @@ from armlink.link.ends import EndCause, cause_of, end_work
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_order
 from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges, require_ranges
-from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.groups import Group, by_joint, make_groups, traits_of
@@ -35,6 +34,7 @@ from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
 from armlink.link.keeper import Keeper
 from armlink.link.park import falling_joints, park, require_deadman
+from armlink.link.reading_bounds import Crossed
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.termination import Presses, end_logger
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from armlink.arrays import Array
 from armlink.drives.orders import Mode
-from armlink.link.guard import ReadingBounds
 from armlink.link.lateness import Lateness
+from armlink.link.reading_bounds import ReadingBounds
 from armlink.torque_calibration import Calibration as Calibration
 
 

@@ -29,9 +29,9 @@ from armlink.errors import ArmlinkError, BusFault, Refused, Stall
 from armlink.link.bus_load import overload
 from armlink.link.ends import EndCause, cause_of
 from armlink.link.gate import TORQUE_MODES
-from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.listener import CLOCK_RESOLUTION, Listener
+from armlink.link.reading_bounds import Crossed
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.ending import Ending, job_teller
 from armlink.loop.messages import (

@@ -8,9 +8,9 @@ import numpy.typing as npt
 
 from armlink.drives.orders import Mode
 from armlink.errors import Refused
-from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
 from armlink.link.joints.groups import make_groups, traits_of
+from armlink.link.reading_bounds import Crossed, ReadingBounds
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.open import ArmDriver
 from calib.arm.kinematics import DriveLimits

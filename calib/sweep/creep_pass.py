@@ -5,7 +5,7 @@ from contextlib import suppress
 import numpy as np
 
 from armlink.errors import Refused, Stall
-from armlink.link.guard import ReadingBounds
+from armlink.link.reading_bounds import ReadingBounds
 from calib.dataset import StallLine
 from calib.motion.mover import Stalled
 from calib.motion.static_reading import StaticReading, bin_readings

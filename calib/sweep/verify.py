@@ -14,7 +14,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from armlink.link.guard import ReadingBounds
+from armlink.link.reading_bounds import ReadingBounds
 from armlink.link.types import Sample
 from armlink.loop.open import ArmDriver
 from armlink.torque_calibration import per_joint

@@ -15,9 +15,9 @@ from armlink.arm_file import ArmFile, bundled_arms, load_arm, parse_arm
 from armlink.drives.orders import Mode, Power
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
 from armlink.link.ends import ENDS, EndCause, cause_of
-from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.park import straight_path
+from armlink.link.reading_bounds import Crossed
 from armlink.link.types import Command
 from armlink.termination import Presses, end_logger
 from sim_bus.bus.lock_step import LockStepBus

@@ -20,9 +20,9 @@ from armlink.bus.open import open_link_bus
 from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.drives.canopen.object_dictionary import STATUS_WORD as STATUS
 from armlink.errors import BusFault, HostLate, Silence
-from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.link import Link
 from armlink.link.listener import Listener
+from armlink.link.reading_bounds import Crossed, ReadingBounds
 from armlink.link.types import Command, Sample, Setpoints
 from armlink.loop.remote_link import RemoteLink
 
