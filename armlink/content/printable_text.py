@@ -11,8 +11,9 @@ import re
 import unicodedata
 from typing import Any
 
-_UNITS = re.compile(r" *(?:`[^`]*`|[^ ])+| +$")
-"""Parts of a line that are not broken, each with the spaces before it; a lone backtick is a letter as any other."""
+_UNITS = re.compile(r" *(?:`[^`]*`|[^ ])+(?: +$)?| +$")
+"""Parts of a line that are not broken, each with the spaces before it, the last also with those after it; a lone
+backtick is a letter as any other."""
 
 
 def printable_text(text: str, keep: str = "") -> str:
@@ -33,10 +34,8 @@ def wrap_text(text: str, width: int) -> str:
     """
     lines = [""]
     for unit in _UNITS.findall(text):
-        word = unit.lstrip(" ")
-        if word and lines != [""] and len(lines[-1]) + len(unit) > width:
-            lines[-1] += unit[: -len(word) - 1]
-            lines.append(word)
+        if unit.strip(" ") and lines != [""] and len(lines[-1]) + len(unit) > width:
+            lines.append(unit[1:])
         else:
             lines[-1] += unit
     return "\n".join(lines)
