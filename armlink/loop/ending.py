@@ -9,7 +9,7 @@ from typing import Any
 
 from armlink.channel import Channel, Closed
 from armlink.link.ends import EndCause
-from armlink.loop.messages import Drop, End, Told
+from armlink.loop.messages import End, JobSignal, Told
 from armlink.termination import Dropped
 
 GRACE_SECONDS = 2.0
@@ -73,7 +73,7 @@ def job_teller(channel: Channel, aside: Callable[[Any], None] = lambda message: 
         except Closed:
             return
         for message in messages:
-            if isinstance(message, Drop):
+            if message is JobSignal.DROP:
                 raise Dropped
             aside(message)
 
@@ -100,7 +100,7 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: C
                 tell("")
             except Dropped:
                 if not dropped:
-                    channel.put(Drop())
+                    channel.put(JobSignal.DROP)
                 dropped = True
     except Closed:
         pass

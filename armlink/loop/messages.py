@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -63,25 +64,19 @@ class RunController:
 
 
 @dataclass(frozen=True)
-class Cut:
-    """Stop where the playing is; the last command stays in force. A function that is being called is interrupted."""
-
-
-@dataclass(frozen=True)
 class End:
     """Bring the arm to its end, and end."""
 
     cause: EndCause
 
 
-@dataclass(frozen=True)
-class Drop:
-    """Let the arm go at once, whatever is done to end it."""
-
-
-@dataclass(frozen=True)
-class Alive:
+class JobSignal(Enum):
+    ALIVE = "alive"
     """The job is there."""
+    CUT = "cut"
+    """Stop where the playing is; the last command stays in force. A function that is being called is interrupted."""
+    DROP = "drop"
+    """Let the arm go at once, whatever is done to end it."""
 
 
 @dataclass(frozen=True)

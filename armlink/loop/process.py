@@ -36,12 +36,11 @@ from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.ending import Ending, job_teller
 from armlink.loop.messages import (
     BATCH_SECONDS,
-    Alive,
     Call,
-    Cut,
     Down,
     End,
     Health,
+    JobSignal,
     LoopAnswer,
     Open,
     Play,
@@ -165,12 +164,10 @@ class DriveLoop:
             case RunController(id, controller):
                 self._begin(id)
                 self._unpickled = self._beside.submit(pickle.loads, controller)
-            case Cut() if self._controller is not None:  # its last torque is right for its last sample alone
+            case JobSignal.CUT if self._controller is not None:  # its last torque is right for its last sample alone
                 self._hold_here()
-            case Cut():
+            case JobSignal.CUT:
                 self._cut()
-            case Alive():
-                pass
 
     def _begin(self, id: int) -> None:
         self._cut()
@@ -205,7 +202,7 @@ class DriveLoop:
         self._channel.flush()
         messages = self._channel.receive()
         self._end = next((each for each in messages if isinstance(each, End)), self._end)
-        if any(isinstance(each, Cut | End) for each in messages):
+        if any(each is JobSignal.CUT or isinstance(each, End) for each in messages):
             raise KeyboardInterrupt
 
     def _sign_of_life(self) -> None:

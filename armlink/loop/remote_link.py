@@ -19,7 +19,7 @@ from armlink.link.park import park
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers, remote
 from armlink.loop.ending import TELL_INTERVAL
-from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
+from armlink.loop.messages import Call, JobSignal, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, end_logger
 
@@ -108,7 +108,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
             return self._call(function, *args, **kw)
         except KeyboardInterrupt:
             with contextlib.suppress(BusFault):  # the function ends at its next `tell`
-                self._put(Cut())
+                self._put(JobSignal.CUT)
             raise
 
     def cycle(self, command: Command) -> Sample:
@@ -156,7 +156,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
         finally:
             if taken < rows:
                 with contextlib.suppress(BusFault):
-                    self._put(Cut())
+                    self._put(JobSignal.CUT)
 
     def _next(self) -> tuple[int, int, Sample]:
         """The next cycle that was not taken yet; raises what stopped the arm, BusFault."""
@@ -181,7 +181,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def _tell(self) -> None:
         if time.monotonic() - self._told > TELL_INTERVAL:
-            self._put(Alive())
+            self._put(JobSignal.ALIVE)
 
     def _put(self, message: object) -> None:
         self._told = time.monotonic()
