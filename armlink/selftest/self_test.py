@@ -16,7 +16,7 @@ from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
 from armlink.link.joints.groups import by_joint, make_groups, traits_of
 from armlink.link.link import Link
-from armlink.link.park import falling_joints, park, path_speeds, straight_path
+from armlink.link.park import cycle_count, falling_joints, park, path_speeds, straight_path
 from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "position", "answers", "enables and holds", "silence", "park")
@@ -196,7 +196,7 @@ class SelfTest:
         seconds = link.clock.now() - start
         on, most = [Power.ON] * link.n, HOLD_TOLERANCE + self._sags()
         sample = self._cycle(on, standing, most)
-        for _ in range(self._cycles(HOLD_SECONDS)):
+        for _ in range(cycle_count(link, HOLD_SECONDS)):
             sample = self._cycle(on, standing, most)
         moved = np.abs(sample.position - standing)
         for joint, name in enumerate(link.names):
@@ -350,6 +350,3 @@ class SelfTest:
                 f"{link.names[joint]}: {text}, so the test was ended: check its load, its brake and its gains"
             )
         return sample
-
-    def _cycles(self, seconds: float) -> int:
-        return max(1, round(seconds / self.link.period))

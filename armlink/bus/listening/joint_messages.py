@@ -154,7 +154,6 @@ class ListeningBus(InProcessBus):
         return self._source.lost
 
     def stamp(self) -> float:
-        """Time of the newest frame since the first [s]."""
         return self._now - self._first
 
     def take(self, timeout: float = 0.0) -> Frame | None:
@@ -172,7 +171,6 @@ class ListeningBus(InProcessBus):
         return taken
 
     def wait(self, timeout: float) -> None:
-        """Return when a frame is there, or after `timeout` seconds."""
         self._fill(timeout)
 
     def recv(self, timeout: float | None = None) -> None:

@@ -231,7 +231,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
     # ---- orders to frames
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """RPDO2 where a mode changes, RPDO1 of every joint, heartbeat when due, SYNC."""
         return self.cycle.frames(orders, now)
 
     def sent(self, joint: int) -> Order | None:
@@ -279,7 +278,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return start if first else [SYNC]
 
     def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:
-        """SYNC and TPDO1, TPDO2 if its values are there; the joints are enabled, in no mode."""
         return self._readings.replayed(first, readings)
 
     # ---- states

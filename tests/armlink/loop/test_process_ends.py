@@ -37,14 +37,14 @@ JOB = """
 import sys
 import numpy as np
 from armlink.arm_file import load_arm
-from armlink.link.park import straight
+from armlink.link.park import straight_path
 from armlink.link.types import Command, Setpoints
 from armlink.loop.remote_link import RemoteLink
 from armlink.termination import terminate_as_interrupt
 with terminate_as_interrupt(), RemoteLink(load_arm(sys.argv[1]), sys.argv[2]) as link:
     link.start()
     link.enable()
-    path = straight(link.position_sent, np.array([float(sys.argv[3])]), np.ones(1), 0.01)
+    path = straight_path(link.position_sent, np.array([float(sys.argv[3])]), np.ones(1), 0.01)
     for _ in link.play(Setpoints.follow(path)):
         pass
     print(link.pid, flush=True)
