@@ -153,7 +153,7 @@ def work():
     finally:
         print("joints safe", flush=True)
 module = types.ModuleType("made_up"); module.work = work; sys.modules["made_up"] = module
-cli.contributed = lambda group: [EntryPoint("work", "made_up:work", group)]
+cli.contributions = lambda group: [EntryPoint("work", "made_up:work", group)]
 sys.argv = ["armlink", "work"]
 cli.main()
 """
@@ -209,7 +209,7 @@ def test_help_takes_less_than_0_3_s_of_cpu():
 
 
 def commands() -> dict[str, EntryPoint]:
-    return {point.name: point for point in cli.contributed("armlink.commands")}
+    return {point.name: point for point in cli.contributions("armlink.commands")}
 
 
 SUB_COMMANDS = [(name,) for name in sorted(commands())] + [

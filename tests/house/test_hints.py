@@ -16,7 +16,7 @@ from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = {point.name: point for point in cli.contributed("armlink.commands")}
+COMMANDS = {point.name: point for point in cli.contributions("armlink.commands")}
 HINT = re.compile(rf"armlink ((?:{'|'.join(COMMANDS)})\b[^;()`\n]*)")
 """A command up to the end of its sentence; a command that is only mentioned stands without the program's name."""
 NO_MESSAGE = {"by", "title"}
