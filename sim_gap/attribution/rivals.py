@@ -4,6 +4,7 @@ General laws (effects/registry.py) represent effects that the library lacks: a c
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from operator import itemgetter
 
 import numpy as np
@@ -159,11 +160,21 @@ class LawTest:
         self.laws = [law for law in offered if law in self.choice.effects]
 
     def best_law(self, terms: Sequence[Term]) -> StandIn:
-        """The law that could best replace these terms: one for all, or one each, of which the worst counts."""
+        """The law that could best replace these terms: one for all, or one each, of which the worst counts; or one for
+        them and all others that act on links, or that few arms have, which may be there to cancel at other joints."""
         own = [term for term in self.choice.current if term in terms]
         apart = [self._instead([term]) for term in own]
         found = [max(apart, key=itemgetter(0))] if apart else [NO_LAW]
-        return min([*found, self._instead(own)] if len(own) > 1 else found, key=itemgetter(0))
+        found += [self._instead(own)] if len(own) > 1 else []
+        found += [law for others, law in self._of_many if not {*own}.isdisjoint(others)]
+        return min(found, key=itemgetter(0))
+
+    @cached_property
+    def _of_many(self) -> list[tuple[list[Term], StandIn]]:
+        """All terms that act on links, and all that few arms have, with the best law in place of them."""
+        on_links = [term for term in self.choice.current if term.form.signature.side == "link"]
+        rare = [term for term in self.choice.current if not term.form.plausibility.every_joint]
+        return [(terms, self._instead(terms)) for terms in (on_links, rare) if terms]
 
     def _instead(self, own: Sequence[Term]) -> StandIn:
         """The best law in place of these terms and of others at its joint that are then not missed."""
