@@ -76,7 +76,9 @@ class Rivals:
         missed = {term: choice.judge(choice.without(term, choice.current)) for term in present}
         most = max(present, key=lambda term: (missed[term], term.place, term.shape), default=None)
         evidence, rivals = self._replaced(most) if most else (0.0, [])
-        return max(evidence, 0.0), tuple(dict.fromkeys([*self._by_one_factor(effect), *self._elsewhere(present), *rivals]))
+        return max(evidence, 0.0), tuple(
+            dict.fromkeys([*self._by_one_factor(effect), *self._elsewhere(present), *rivals])
+        )
 
     def _elsewhere(self, present: Sequence[Term]) -> list[str]:
         """What searches that began elsewhere ended with, as good, in place of one of these terms of one effect."""
@@ -85,7 +87,9 @@ class Rivals:
         ends = [terms for score, terms in choice.others if choice.loss(score) < AS_GOOD]
         lacking = [terms for terms in ends if own - {term.key for term in terms}]
         effects = {name for name, _ in own}
-        return [term.effect for terms in lacking for term in terms if term.key not in there and term.effect not in effects]
+        return [
+            term.effect for terms in lacking for term in terms if term.key not in there and term.effect not in effects
+        ]
 
     def _by_one_factor(self, effect: str) -> list[str]:
         """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,

@@ -19,9 +19,9 @@ from sim_gap.search.term import CONSTANT, MASSES, OF_LINKS, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
 
-def one_cause_of_gravity(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
-    """The chosen terms with the one effect in place of the mass moments of several links that explains most, about the
-    nominal model; none if that is no question.
+def one_cause_of_gravity(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[list[Term]]:
+    """The chosen terms with one effect in place of the mass moments of several links, for the two effects that explain
+    most, about the nominal model; none if that is no question.
 
     A body at the tip, a joint's zero that is off or a base that leans change gravity at several joints, much as mass
     moments of several links do. Linear in what is small, each of them fits a little worse than these, and no exchange of
@@ -33,7 +33,7 @@ def one_cause_of_gravity(store: ColumnStore, choice: TermChoice, offered: Sequen
     about = TermChoice(TermEquations(store, list(dict.fromkeys([*rest, *offered]))), rest)
     others = [term for term in about.equations.terms if term not in about.current and term.effect != MASSES]
     trials = [about.with_needs(term, rest) for term in about.shortlist(rest, others, EXCHANGED)]
-    return min((trial for trial in trials if np.isfinite(about.judge(trial))), key=about.judge, default=[])
+    return sorted((trial for trial in trials if np.isfinite(about.judge(trial))), key=about.judge)[:2]
 
 
 def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
@@ -58,11 +58,9 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
     offered, chosen = first_search(store, library)
     store.keep(offered)
     choice = search_again(store, chosen, offered)
-    found = [(choice.score, choice)]
-    if start := one_cause_of_gravity(store, choice, offered):
-        again = search_again(store, start, offered)
-        found.append((again.score, again))
-        choice = min(found, key=itemgetter(0))[1]
+    starts = one_cause_of_gravity(store, choice, offered)
+    found = [(each.score, each) for each in [choice, *(search_again(store, start, offered) for start in starts)]]
+    choice = min(found, key=itemgetter(0))[1]
     if start := every_constant(choice, offered):
         again = search_again(store, start, offered, frozenset({CONSTANT}))
         together = PRICE * effects()[CONSTANT].plausibility.prior_penalty  # of one effect that few arms have
