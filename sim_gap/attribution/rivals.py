@@ -83,13 +83,10 @@ class Rivals:
     def _elsewhere(self, present: Sequence[Term]) -> list[str]:
         """What searches that began elsewhere ended with, as good, in place of one of these terms of one effect."""
         choice, own = self.choice, {term.key for term in present}
-        there = {term.key for term in choice.current}
+        there, effects = {term.key for term in choice.current}, {term.effect for term in present}
         ends = [terms for score, terms in choice.others if choice.loss(score) < AS_GOOD]
-        lacking = [terms for terms in ends if own - {term.key for term in terms}]
-        effects = {name for name, _ in own}
-        return [
-            term.effect for terms in lacking for term in terms if term.key not in there and term.effect not in effects
-        ]
+        lacking = [term for terms in ends if own - {term.key for term in terms} for term in terms]
+        return [term.effect for term in lacking if term.key not in there and term.effect not in effects]
 
     def _by_one_factor(self, effect: str) -> list[str]:
         """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,

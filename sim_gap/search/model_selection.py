@@ -24,8 +24,8 @@ def one_cause_of_gravity(store: ColumnStore, choice: TermChoice, offered: Sequen
     most, about the nominal model; none if that is no question.
 
     A body at the tip, a joint's zero that is off or a base that leans change gravity at several joints, much as mass
-    moments of several links do. Linear in what is small, each of them fits a little worse than these, and no exchange of
-    one for one leads back.
+    moments of several links do. Linear in what is small, each of them fits a little worse than these, and no exchange
+    of one for one leads back.
     """
     rest = [term for term in choice.current if term.effect != MASSES]
     if len(choice.current) - len(rest) < 2:
