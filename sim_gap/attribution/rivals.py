@@ -167,26 +167,29 @@ class LawTest:
         apart = [self._instead([term]) for term in own]
         found = [max(apart, key=itemgetter(0))] if apart else [NO_LAW]
         found += [self._instead(own)] if len(own) > 1 else []
-        found += [law for others, law in self._of_many if not {*own}.isdisjoint(others)]
-        return min(found, key=itemgetter(0))
+        groups = [others for others in (self._on_links, self._rare) if {*own} < {*others}]
+        return min([*found, *(self._instead(own, others) for others in groups)], key=itemgetter(0))
 
     @cached_property
-    def _of_many(self) -> list[tuple[list[Term], StandIn]]:
-        """All terms that act on links, and all that few arms have, with the best law in place of them."""
-        on_links = [term for term in self.choice.current if term.form.signature.side == "link"]
-        rare = [term for term in self.choice.current if not term.form.plausibility.every_joint]
-        return [(terms, self._instead(terms)) for terms in (on_links, rare) if terms]
+    def _on_links(self) -> list[Term]:
+        return [term for term in self.choice.current if term.form.signature.side == "link"]
 
-    def _instead(self, own: Sequence[Term]) -> StandIn:
-        """The best law in place of these terms and of others at its joint that are then not missed."""
+    @cached_property
+    def _rare(self) -> list[Term]:
+        return [term for term in self.choice.current if not term.form.plausibility.every_joint]
+
+    def _instead(self, own: Sequence[Term], gone: Sequence[Term] = ()) -> StandIn:
+        """The best law in place of these terms, of others that are `gone` but no cases of the law, and of those at its
+        joint that are then not missed."""
         choice, best = self.choice, NO_LAW
         rest = choice.current
-        for term in own:
+        for term in gone or own:
             rest = choice.without(term, rest)
         laws = [law for law in self.laws if not all(self._is_case(term, law) for term in own)]
         for law in choice.shortlist(rest, laws, LAWS_TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
-            worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
+            cases = [term for term in gone if term not in own and self._is_case(term, law)]
+            worse = choice.loss(choice.judge(choice.pruned([*rest, *cases, law], beside)))
             best = min(best, (worse, law.effect), key=itemgetter(0))
         return best
 
