@@ -14,7 +14,7 @@ from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import CONSTANT, INERTIA, MASSES, OF_LINKS, Term
+from sim_gap.search.term import Term
 from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
 AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
@@ -76,29 +76,15 @@ class Rivals:
         missed = {term: choice.judge(choice.without(term, choice.current)) for term in present}
         most = max(present, key=lambda term: (missed[term], term.place, term.shape), default=None)
         evidence, rivals = self._replaced(most) if most else (0.0, [])
-        return max(evidence, 0.0), tuple(
-            dict.fromkeys([*self._by_one_factor(effect), *self._elsewhere(present), *rivals])
-        )
+        return max(evidence, 0.0), tuple(dict.fromkeys([*self._elsewhere(present), *rivals]))
 
     def _elsewhere(self, present: Sequence[Term]) -> list[str]:
-        """What searches that began elsewhere ended with, as good, in place of one of these terms of one effect."""
+        """Effects with which searches that began elsewhere ended, as good, in place of one of these terms of one."""
         choice, own = self.choice, {term.key for term in present}
         there, effects = {term.key for term in choice.current}, {term.effect for term in present}
         ends = [terms for score, terms in choice.others if choice.loss(score) < AS_GOOD]
         lacking = [term for terms in ends if own - {term.key for term in terms} for term in terms]
         return [term.effect for term in lacking if term.key not in there and term.effect not in effects]
-
-    def _by_one_factor(self, effect: str) -> list[str]:
-        """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,
-        if they explain as much at the price of one effect: motor torque alone tells their products."""
-        choice = self.choice
-        if effect not in (*OF_LINKS, CONSTANT) or choice.equations.layout.sensor:
-            return []
-        gone, others = (OF_LINKS, (CONSTANT,)) if effect in OF_LINKS else ((CONSTANT,), (MASSES, INERTIA))
-        rest = [term for term in choice.current if term.effect not in gone or term.bound]
-        more = [term for term in choice.effects if term.effect in others and term not in rest]
-        score = choice.judge([*rest, *more]) - choice.price(more[1:])
-        return [others[0]] if choice.loss(score) < AS_GOOD else []
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""
