@@ -4,6 +4,7 @@ General laws (effects/registry.py) represent effects that the library lacks: a c
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from operator import itemgetter
 
 import numpy as np
@@ -13,7 +14,7 @@ from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.registry import LAWS
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import CONSTANT, INERTIA, MASSES, OF_LINKS, Term
+from sim_gap.search.term import Term
 from sim_gap.search.term_equations import MOST_MEASUREMENTS, TermChoice, TermEquations
 
 AS_GOOD = 3.0 * PRICE / MOST_MEASUREMENTS
@@ -75,19 +76,15 @@ class Rivals:
         missed = {term: choice.judge(choice.without(term, choice.current)) for term in present}
         most = max(present, key=lambda term: (missed[term], term.place, term.shape), default=None)
         evidence, rivals = self._replaced(most) if most else (0.0, [])
-        return max(evidence, 0.0), tuple(dict.fromkeys([*self._by_one_factor(effect), *rivals]))
+        return max(evidence, 0.0), tuple(dict.fromkeys([*self._elsewhere(present), *rivals]))
 
-    def _by_one_factor(self, effect: str) -> list[str]:
-        """Constants of all motors in place of the masses named, or masses of all links in place of the constants named,
-        if they explain as much at the price of one effect: motor torque alone tells their products."""
-        choice = self.choice
-        if effect not in (*OF_LINKS, CONSTANT) or choice.equations.layout.sensor:
-            return []
-        gone, others = (OF_LINKS, (CONSTANT,)) if effect in OF_LINKS else ((CONSTANT,), (MASSES, INERTIA))
-        rest = [term for term in choice.current if term.effect not in gone or term.bound]
-        more = [term for term in choice.effects if term.effect in others and term not in rest]
-        score = choice.judge([*rest, *more]) - choice.price(more[1:])
-        return [others[0]] if choice.loss(score) < AS_GOOD else []
+    def _elsewhere(self, present: Sequence[Term]) -> list[str]:
+        """Effects with which searches that began elsewhere ended, as good, in place of one of these terms of one."""
+        choice, own = self.choice, {term.key for term in present}
+        there, effects = {term.key for term in choice.current}, {term.effect for term in present}
+        ends = [terms for score, terms in choice.others if choice.loss(score) < AS_GOOD]
+        lacking = [term for terms in ends if own - {term.key for term in terms} for term in terms]
+        return [term.effect for term in lacking if term.key not in there and term.effect not in effects]
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""
@@ -150,22 +147,35 @@ class LawTest:
         self.laws = [law for law in offered if law in self.choice.effects]
 
     def best_law(self, terms: Sequence[Term]) -> StandIn:
-        """The law that could best replace these terms: one for all, or one each, of which the worst counts."""
+        """The law that could best replace these terms: one for all, or one each, of which the worst counts; or one for
+        them and all others that act on links, or that few arms have, which may be there to cancel at other joints."""
         own = [term for term in self.choice.current if term in terms]
         apart = [self._instead([term]) for term in own]
         found = [max(apart, key=itemgetter(0))] if apart else [NO_LAW]
-        return min([*found, self._instead(own)] if len(own) > 1 else found, key=itemgetter(0))
+        found += [self._instead(own)] if len(own) > 1 else []
+        groups = [others for others in (self._on_links, self._rare) if {*own} < {*others}]
+        return min([*found, *(self._instead(own, others) for others in groups)], key=itemgetter(0))
 
-    def _instead(self, own: Sequence[Term]) -> StandIn:
-        """The best law in place of these terms and of others at its joint that are then not missed."""
+    @cached_property
+    def _on_links(self) -> list[Term]:
+        return [term for term in self.choice.current if term.form.signature.side == "link"]
+
+    @cached_property
+    def _rare(self) -> list[Term]:
+        return [term for term in self.choice.current if not term.form.plausibility.every_joint]
+
+    def _instead(self, own: Sequence[Term], gone: Sequence[Term] = ()) -> StandIn:
+        """The best law in place of these terms, of others that are `gone` but no cases of the law, and of those at its
+        joint that are then not missed."""
         choice, best = self.choice, NO_LAW
         rest = choice.current
-        for term in own:
+        for term in gone or own:
             rest = choice.without(term, rest)
         laws = [law for law in self.laws if not all(self._is_case(term, law) for term in own)]
         for law in choice.shortlist(rest, laws, LAWS_TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
-            worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
+            cases = [term for term in gone if term not in own and self._is_case(term, law)]
+            worse = choice.loss(choice.judge(choice.pruned([*rest, *cases, law], beside)))
             best = min(best, (worse, law.effect), key=itemgetter(0))
         return best
 

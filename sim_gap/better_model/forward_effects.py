@@ -305,8 +305,8 @@ def _window(
     data.qpos[effects.places], data.qvel[effects.dofs] = state
     data.time = time
     out, speed, elastic = np.empty_like(reading), data.qvel, effects.is_elastic
-    for k in range(len(reading)):
-        data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
+    for k, torque in enumerate(0.5 * (drive[:-1] + drive[1:])):
+        data.qfrc_applied[effects.dofs] = torque
         for _ in range(each):
             mujoco.mj_step(model, data)
             np.minimum(np.maximum(speed, -WILD, out=speed), WILD, out=speed)

@@ -111,11 +111,11 @@ def find_wrong_columns(
 def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
     """Fall of the cost by each hypothesis, less the price, on some of the rows, (M,)."""
     changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
-    moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]
+    moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q or each.rubs != motion.rubs]
     motions = [each.thinned(SCREENING_ROWS) for each in changed]
     made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
     models = dict(zip(moved, np.split(made, len(moved)), strict=True))
-    costs = quick_costs(arm, np.array([models.get(k, models[0]) for k in range(len(motions))]), motions)
+    costs = quick_costs(arm, np.array([models.get(k, models[0]) for k in range(len(motions))]), motions, moved)
     return np.asarray(costs[0] - costs[1:] - PRICE * np.array([hypothesis.choices for hypothesis in possible]))
 
 

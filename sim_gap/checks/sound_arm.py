@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arm.rigid_body import CREEP, INERTIAL, RigidArm
 from gcomp.arrays import Array, Mask
@@ -133,51 +134,66 @@ def measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
 
 
 def _own_columns(
-    arm: RigidArm, rubs: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
+    scale: Array, most: Array, rubs: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
 ) -> tuple[Array, Array]:
     """Columns of the P own effects of each joint (…, n, P, K), friction and rotor at the end, which are not negative,
-    and their standard deviations (…, n, P), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
-    size = _model_size(model)
+    and their standard deviations (…, n, P), of arrays (…, K, n); `scale` (…, n) by `_model_size`, `most` (…, 1) the
+    torque of the arm stretched out or more, `rubs` (…) as in `ChannelMotion`."""
     turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / CREEP, -1.0, 1.0)
     turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
-    own = [model / size[..., None, :], np.ones_like(q), turned, direction, v, a]
+    own = [model / scale[..., None, :], np.ones_like(q), turned, direction, v, a]
     columns = np.moveaxis(np.stack(own, axis=-3), -1, -3)
     rubbing = np.maximum(np.stack([x.std(-2) for x in own[JOINT_EFFECTS - FRICTION_EFFECTS :]], axis=-1), 1e-9)
-    most = np.maximum(arm.stretched_torque, size.max(-1, keepdims=True))
-    pulled = np.maximum(size, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
+    pulled = np.maximum(scale, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
     friction = most[..., None] * np.where(rubs, 1.0, BEARING_FRICTION_STD)[..., None, None] / rubbing
-    usual = ERROR_STD * np.stack([size, pulled, pulled], axis=-1)
+    usual = ERROR_STD * np.stack([scale, pulled, pulled], axis=-1)
     return columns, np.concatenate([usual, friction], axis=-1)
 
 
-def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) -> Array:
+def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion], moved: Sequence[int]) -> Array:
     """Negative log likelihood of each of several motions, by each joint's own effects alone, (M,); model torques
-    (M, K, n)."""
-    parts = np.array_split(np.arange(len(motions)), -(-len(motions) * models.shape[1] // ROWS_AT_ONCE))
-    return np.concatenate([_stacked_costs(arm, models[part], [motions[k] for k in part]) for part in parts])
+    (M, K, n). All but those numbered in `moved` differ from the first in some readings alone."""
+    reading = np.array([motion.reading for motion in motions])
+    own = np.any((reading != reading[0]) & ~(np.isnan(reading) & np.isnan(reading[0])), axis=1)
+    own[[0, *moved]] = True
+    costs, pairs = np.empty(own.shape), np.argwhere(own)
+    for part in np.array_split(pairs, -(-len(pairs) * models.shape[1] // ROWS_AT_ONCE)):
+        costs[tuple(part.T)] = _stacked_costs(arm, models, motions, *part.T)
+    return np.asarray(np.where(own, costs, costs[0]).sum(1))
 
 
-def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    q, v, a, read, size, count, floor, idle, rubs = (
-        np.array([getattr(motion, name) for motion in motions])
-        for name in ("q", "v", "a", "reading", "size", "count", "least", "idle", "rubs")
+def _stacked_costs(
+    arm: RigidArm, models: Array, motions: Sequence[ChannelMotion], which: NDArray[np.intp], joint: NDArray[np.intp]
+) -> Array:
+    """The same of some joints of some motions, (P,): arrays of one joint each, (P, K, 1)."""
+    size, count, floor, idle = (
+        np.array([getattr(motions[m], name)[j] for m, j in zip(which, joint, strict=True)])[:, None]
+        for name in ("size", "count", "least", "idle")
     )
-    telling = _telling(v, read, np.array([motion.channel == "tau" for motion in motions])[:, None, None])
+    q, v, a, read = (
+        np.array([getattr(motions[m], name)[:, j] for m, j in zip(which, joint, strict=True)])[:, :, None]
+        for name in ("q", "v", "a", "reading")
+    )
+    rubs, of_sensor = np.array([(motions[m].rubs, motions[m].channel == "tau") for m in which]).T
+    scale = _model_size(models)
+    most = np.maximum(arm.stretched_torque, scale.max(-1, keepdims=True))
+    model, scale, most = models[which, :, joint][:, :, None], scale[which, joint][:, None], most[which]
+    telling = _telling(v, read, of_sensor[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
-    columns, spread = _own_columns(arm, rubs, model, reading, q, v, a)
+    columns, spread = _own_columns(scale, most, rubs, model, reading, q, v, a)
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
     turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
-    turn[..., JOINT_EFFECTS, 0] = _model_size(model)
+    turn[..., JOINT_EFFECTS, 0] = scale
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
     without[..., CARRIED, :], without[..., :, CARRIED] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
-    whole += CERTAIN_COST * beyond_range(arm, q)
-    return np.asarray((whole - count * np.log(np.maximum(size, SMALLEST_TORQUE))).sum(1))
+    whole += CERTAIN_COST * beyond_range(arm, np.array([motion.q for motion in motions]))[which, joint][:, None]
+    return np.asarray((whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))[:, 0])
 
 
 def _model_size(model: Array) -> Array:
@@ -237,7 +253,9 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     model's torque and has nothing of it, at a price."""
     model = arm.carried(motion.q, motion.v, motion.a)
     reading = np.where(np.isfinite(motion.reading), motion.reading, model)
-    own, spread = _own_columns(arm, np.array(motion.rubs), model, reading, motion.q, motion.v, motion.a)
+    scale = _model_size(model)
+    most = np.maximum(arm.stretched_torque, scale.max(-1, keepdims=True))
+    own, spread = _own_columns(scale, most, np.array(motion.rubs), model, reading, motion.q, motion.v, motion.a)
     limits = _own_limits(spread)
     shared = _shared_columns(arm, motion)
     left = (reading - model).T

@@ -2,10 +2,12 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from gcomp.estimate.choice import EXCHANGED
 from gcomp.estimate.linear_terms import PRICE
 from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
@@ -13,21 +15,25 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SHAPE_STEP, SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge
-from sim_gap.search.term import BODY, CONSTANT, MASSES, OF_LINKS, Term
+from sim_gap.search.term import CONSTANT, MASSES, OF_LINKS, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
 
 
-def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
-    """The chosen terms with a payload in place of the mass moments of several links; none if that is no question.
+def one_cause_of_gravity(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[list[Term]]:
+    """The chosen terms with one effect in place of the mass moments of several links, for the two effects that explain
+    most, about the nominal model; none if that is no question.
 
-    Linear in its mass and first moment, a payload lacks the inertia that its mass has where it hangs; mass moments of
-    all links together then fit a little better, and no single exchange leads back.
+    A body at the tip, a joint's zero that is off or a base that leans change gravity at several joints, much as mass
+    moments of several links do. Linear in what is small, each of them fits a little worse than these, and no exchange
+    of one for one leads back.
     """
-    chosen = choice.current
-    bodies = [term for term in offered if term.effect == BODY and not term.shape]
-    rest = [term for term in chosen if term.effect != MASSES]
-    several = len(chosen) - len(rest) > 1 and not any(term.effect == BODY for term in chosen)
-    return [*rest, bodies[0]] if several and bodies else []
+    rest = [term for term in choice.current if term.effect != MASSES]
+    if len(choice.current) - len(rest) < 2:
+        return []
+    about = TermChoice(TermEquations(store, list(dict.fromkeys([*rest, *offered]))), rest)
+    others = [term for term in about.equations.terms if term not in about.current and term.effect != MASSES]
+    trials = [about.with_needs(term, rest) for term in about.shortlist(rest, others, EXCHANGED)]
+    return sorted((trial for trial in trials if np.isfinite(about.judge(trial))), key=about.judge)[:2]
 
 
 def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
@@ -45,19 +51,24 @@ def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
-    """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
+    """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place.
+
+    A search ends where no single step helps; what others found that began elsewhere is among the choice's `others`.
+    """
     offered, chosen = first_search(store, library)
     store.keep(offered)
     choice = search_again(store, chosen, offered)
-    if start := one_body(choice, offered):
-        again = search_again(store, start, offered)
-        choice = again if again.score < choice.score else choice
+    starts = one_cause_of_gravity(store, choice, offered)
+    found = [(each.score, each) for each in [choice, *(search_again(store, start, offered) for start in starts)]]
+    choice = min(found, key=itemgetter(0))[1]
     if start := every_constant(choice, offered):
         again = search_again(store, start, offered, frozenset({CONSTANT}))
         together = PRICE * effects()[CONSTANT].plausibility.prior_penalty  # of one effect that few arms have
-        choice = again if again.score + together < choice.score else choice
+        found.append((again.score + together, again))
+    choice = min(found, key=itemgetter(0))[1]
     for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
+    choice.others = [(score, other.current) for score, other in found if other is not choice]
     return choice
 
 

@@ -205,3 +205,33 @@ def test_two_causes_that_replace_one_another_are_not_both_called_minor():
     answer = diagnose(arm, recordings[:1], recordings[1:])
     dry = [cause for cause in answer.causes if cause.effect in ("friction.coulomb", "friction.load")]
     assert "shoulder_lift_joint" in {joint for cause in dry for joint in cause.joints}
+
+
+FIVE = """
+<mujoco><option gravity="0 0 -9.81"/><worldbody>
+<body pos="0 0 0.2"><joint name="joint_1" axis="0 0 1"/>
+ <inertial pos="0 0 0.05" mass="4" diaginertia="0.02 0.02 0.02"/>
+ <body pos="0 0 0.1"><joint name="joint_2" axis="0 1 0"/>
+  <inertial pos="0.02 0 0.25" mass="5" diaginertia="0.08 0.08 0.01"/>
+  <body pos="0 0 0.45"><joint name="joint_3" axis="0 1 0"/>
+   <inertial pos="0.01 0 0.2" mass="3" diaginertia="0.04 0.04 0.01"/>
+   <body pos="0 0 0.4"><joint name="joint_4" axis="0 1 0"/>
+    <inertial pos="0 0.03 0.06" mass="1.5" diaginertia="0.004 0.004 0.002"/>
+    <body pos="0 0 0.1"><joint name="joint_5" axis="0 0 1"/>
+     <inertial pos="0.03 0 0.05" mass="0.8" diaginertia="0.001 0.001 0.001"/>
+    </body></body></body></body></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_zero_that_is_off_beside_a_wrong_mass_is_not_mass_moments_of_two_links(seed):
+    random, zero = np.random.default_rng(seed), np.zeros(5)
+    zero[3] = random.choice([-1.0, 1.0]) * random.uniform(0.15, 0.3)
+    rubs = {"coulomb": random.uniform(0.2, 1.0, 5), "viscous": random.uniform(0.2, 1.0, 5)}
+    wrong = Wrong(position_offset=zero, moved={2: tuple(random.normal(0.0, 0.02, 3))}, **rubs)
+    train, other = (record(model(FIVE), wrong, seed=seed + s, channels=("tau_motor",)) for s in (0, 100))
+    answer = diagnose(model(FIVE), [train], [other])
+    assert value(answer, "position.offset", "joint_4", "offset").value == pytest.approx(zero[3], rel=0.2)
+    (masses,) = [cause for cause in answer.causes if cause.effect == "link.mass_moment"]
+    assert masses.joints == ("joint_3",)

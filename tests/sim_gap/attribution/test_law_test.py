@@ -52,6 +52,16 @@ def test_where_a_law_does_for_a_crowd_of_small_causes_the_crowd_gives_way():
     assert worse < 0.0
 
 
+def test_where_a_law_does_for_all_that_few_arms_have_none_of_it_is_certain():
+    """A sensor's gain, fitted as the motor's and a mass that makes up for it in the sensor's reading."""
+    crowd = Term("actuator.gain", 1), Term("link.mass_moment", 1), Term("link.mass_moment", 0)
+    test = law_test(Wrong(gain=np.array([1.0, 0.9, 1.0])), *crowd)
+    for term in crowd:
+        worse, law = test.best_law([term])
+        assert law == "law.load"
+        assert worse < 0.0
+
+
 HIDDEN = (("link.payload", Wrong(payload=1.0)), ("base.tilt", Wrong(tilt=(0.05, 0.04))))
 
 

@@ -24,6 +24,7 @@ def lag_choice(
     return SimpleNamespace(
         current=current,
         score=0.0,
+        others=[],
         usual=frozenset(),
         effects=dict.fromkeys([*current, *CLIPS, DELAY, *others]),
         equations=SimpleNamespace(measurements=1.0, layout=None, store=SimpleNamespace(nominal=None, values={})),
@@ -45,6 +46,15 @@ def rivals(scores: dict[Term | None, float]) -> tuple[str, ...]:
 def test_what_does_nearly_as_well_is_a_rival_and_what_brings_little_is_not():
     assert rivals({None: 0.4, DELAY: 0.01}) == ("actuator.delay",)
     assert rivals({None: 0.4, DELAY: 0.2}) == ()
+
+
+@pytest.mark.parametrize(("score", "named"), [(0.01, ("actuator.delay",)), (0.2, ())])
+def test_what_a_search_from_elsewhere_ended_with_is_a_rival_if_it_is_as_good(score, named):
+    choice = lag_choice({frozenset(): 0.4}, [LAG])
+    choice.others = [(score, [DELAY])]
+    assert Rivals(choice).weigh("actuator.lag", [LAG])[1] == named
+    choice.others = [(score, [LAG, DELAY])]  # which has the lag as well
+    assert Rivals(choice).weigh("actuator.lag", [LAG])[1] == ()
 
 
 @pytest.mark.parametrize("price", [0.012, 0.04])

@@ -189,15 +189,19 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
     assert relinearised_in_place(None, [], [bent]) == [bent]
 
 
-@pytest.mark.parametrize(("score", "kept"), [(1.0, "several"), (3.0, "first")])
-def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_better(monkeypatch, score, kept) -> None:
+@pytest.mark.parametrize(("score", "kept", "other"), [(1.0, "several", 2.0), (3.0, "first", 3.0)])
+def test_one_cause_in_place_of_several_errors_of_links_is_kept_if_it_scores_better(
+    monkeypatch, score, kept, other
+) -> None:
     def found(name: str, score: float) -> SimpleNamespace:
         store = SimpleNamespace(keep=lambda terms: None)
-        return SimpleNamespace(name=name, score=score, current=[], equations=SimpleNamespace(store=store))
+        return SimpleNamespace(name=name, score=score, current=[name], equations=SimpleNamespace(store=store))
 
     results = iter([found("first", 2.0), found("several", score)])
     monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
     monkeypatch.setattr(model_selection, "search_again", lambda store, chosen, offered: next(results))
-    monkeypatch.setattr(model_selection, "one_body", lambda choice, offered: [PAYLOAD])
+    monkeypatch.setattr(model_selection, "one_cause_of_gravity", lambda store, choice, offered: [[PAYLOAD]])
     monkeypatch.setattr(model_selection, "every_constant", lambda choice, offered: [])
-    assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
+    choice = select_model(SimpleNamespace(keep=lambda terms: None), [])
+    assert choice.name == kept
+    assert [each for each, _ in choice.others] == [other]
