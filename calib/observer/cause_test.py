@@ -17,7 +17,6 @@ from calib.observer.config import WindowSizes
 from calib.observer.evidence import (
     DRIFT,
     INEXACT,
-    Belief,
     ChangeFit,
     ChangeHypothesis,
     Verdict,
@@ -25,6 +24,8 @@ from calib.observer.evidence import (
     smallest_noticed_change,
     span,
 )
+from calib.observer.gravity_belief import GravityBelief
+from calib.observer.motor_belief import MotorBelief
 from gcomp.arrays import Array
 from gcomp.estimate.posterior import linear_posterior
 from gcomp.gravity.torque import gravity_levers
@@ -48,6 +49,9 @@ CAUSES = {
     "scale": ("torque.gain",),
 }
 """Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
+
+Belief = GravityBelief | MotorBelief
+"""What is known of an arm from its records and from rows in which nothing had changed."""
 
 
 def kin(entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:

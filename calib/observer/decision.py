@@ -7,7 +7,6 @@ import numpy as np
 
 from armlink.torque_calibration import TorqueCalibration
 from calib.fit.calibration import SIGNIFICANCE, VERY_STRONG_EVIDENCE
-from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import AGREEMENT, CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.evidence import Verdict
@@ -65,13 +64,6 @@ class DriftFinding:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
         return cls(**{**values, "covariance": np.array(values["covariance"])})
-
-
-@dataclass(frozen=True)
-class Agreeing:
-    rows: list[StaticReading]
-    test: CauseTest
-    joints: frozenset[int]
 
 
 def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int | None) -> bool:

@@ -2,14 +2,10 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
 
 import numpy as np
 
-from calib.motion.static_reading import StaticReading
-from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
-from gcomp.identify.readings import StaticReadings
 
 DRIFT = ("gain", "offset", "drift")
 """Causes that are a drift of a torque sensor: of gain, of offset, or both."""
@@ -61,63 +57,6 @@ class Residuals:
     """Torque that the model lacks anyway (n,) [N·m]: effects of an arm up to this size are nothing new."""
     relative_level: Array
     """The same as a share of the torque (n,): changes' own shapes are as inexact, at most by `INEXACT`."""
-
-
-class Belief(Protocol):
-    """An arm as it is believed to be, from its records and from rows in which nothing had changed."""
-
-    arm: Arm
-    sigma: Array
-    """Standard deviation of one row (n,) [N·m]."""
-    mass: float
-    """Of the loads that the model has taken over as tools [kg]."""
-    of_sensors: bool
-    """Whether torques are those of sensors, which may be corrected; else they are motor currents."""
-    misfit_limit: float
-    """(χ² − dof)/√(2 dof) above which no single change explains rows."""
-    change_std: Array
-    """Of a joint's gain and offset (2,) where rows tell nothing [1, N·m]."""
-
-    @property
-    def payload_rank(self) -> int:
-        """How many of a payload's mass and moments rows must show."""
-
-    @property
-    def learnt(self) -> int:
-        """Rows that it rests on."""
-
-    @property
-    def is_first(self) -> bool:
-        """Whether rows may still tell anything, as they do soon after the calibration."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether rows or the records have told how far the arm may be from its model."""
-
-    def torque(self, q: Array) -> Array:
-        """Gravity torque (K, n) [N·m] at poses q (K, n)."""
-
-    def residuals(self, window: StaticReadings, temperature: Array | None = None) -> Residuals:
-        """Of K rows with true angles; temperatures (K, n) [°C] if told."""
-
-    def before(self, position: Array) -> Self:
-        """The belief from the rows before the one of this pose (n,): what a window is tested against."""
-
-    def learn(self, rows: list[StaticReading]) -> None:
-        """Take rows in which nothing has changed."""
-
-    def adapt(self, rows: list[StaticReading]) -> None:
-        """Adapt the scatter alone to rows that nothing explains."""
-
-    def close(self) -> None:
-        """A sensor was corrected: rows from now on tell nothing of gains and offsets."""
-
-    def anywhere(self, count: int) -> StaticReadings | None:
-        """Rows over the whole range, as many as may be; None if it cannot say where the arm will move."""
-
-    def save(self) -> dict[str, Any]: ...
-
-    def restore(self, values: dict[str, Any]) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,11 @@
 """From an alarm to a decision: the rows gathered for the next cause test, and the results of the tests before it."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest
 from calib.observer.config import PLACE_SIZE, WindowSizes
-from calib.observer.decision import Agreeing
 from calib.observer.saved_values import read_rows, save_rows
 from gcomp.arrays import Array, as_array
 
@@ -33,10 +30,10 @@ class Investigation:
         """New rows since the last test; repeated poses; consecutive windows that found the same payload."""
         self.doubtful = 0
         """Windows in a row that had no single cause."""
-        self.first: Agreeing | None = None
-        """Rows that found a drift, to be confirmed by the next window."""
         self.suspected: tuple[str, tuple[int, ...]] | None = None
-        """Cause and joints that fresh rows have found once; only while it is silent."""
+        """Cause and joints that the window before found, to be confirmed by the next one."""
+        self.first: list[StaticReading] = []
+        """Its rows if it was a drift."""
         self.reported: tuple[str, tuple[int, ...]] | None = None
         """The last verdict reported: cause and joints."""
         self.size: Array = np.empty(0)
@@ -102,7 +99,8 @@ class Investigation:
         return rows
 
     def save(self) -> dict[str, Any]:
-        first, said = self.first, self.reported
+        said, suspected = self.reported, self.suspected
+        joints = [] if suspected is None else list(suspected[1])
         return {
             "held": self.held,
             "silent": self.silent,
@@ -112,24 +110,21 @@ class Investigation:
             "window": save_rows(self.window),
             "fresh": self.fresh,
             "repeated": self.repeated,
-            "first": None if first is None else {"rows": save_rows(first.rows), "joints": sorted(first.joints)},
-            "suspected": None if self.suspected is None else [self.suspected[0], list(self.suspected[1])],
+            "first": {"rows": save_rows(self.first), "joints": joints} if self.first else None,
+            "suspected": None if suspected is None else [suspected[0], joints],
             "said": None if said is None else [said[0], list(said[1])],
             "size": self.size.tolist(),
             "reasons": list(self.reasons),
         }
 
-    def restore(self, values: dict[str, Any], cause_test: Callable[[list[StaticReading]], CauseTest]) -> None:
-        """`cause_test` makes the test of the rows to be confirmed, by the restored belief."""
+    def restore(self, values: dict[str, Any]) -> None:
+        """States of before `suspected` was kept have it in `first`."""
         self.window, first, said = read_rows(values["window"], self._n), values["first"], values["said"]
-        self.first = None
-        if first is not None:
-            rows = read_rows(first["rows"], self._n)
-            self.first = Agreeing(rows, cause_test(rows), frozenset(map(int, first["joints"])))
+        self.first = [] if first is None else read_rows(first["rows"], self._n)
         self.reported = None if said is None else (str(said[0]), tuple(said[1]))
         self.size = as_array("size", np.array(values.get("size", []), dtype=float), (None,))
-        suspected = values.get("suspected")
-        self.suspected = None if suspected is None else (str(suspected[0]), tuple(suspected[1]))
+        suspected = values.get("suspected") or (None if first is None else ["drift", first["joints"]])
+        self.suspected = None if suspected is None else (str(suspected[0]), tuple(map(int, suspected[1])))
         self.fresh, self.repeated, self.carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
         self.held, self.doubtful, self.reasons = bool(values["held"]), int(values["doubtful"]), tuple(values["reasons"])
         self.learned, self.silent = int(values.get("learned", 0)), bool(values.get("silent", False))

@@ -17,7 +17,7 @@ import numpy as np
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading
 from calib.observer.alarms import AlarmWatch
-from calib.observer.cause_test import CauseTest, DetectionLimits, cause_test, limits
+from calib.observer.cause_test import Belief, CauseTest, DetectionLimits, cause_test, limits
 from calib.observer.config import (
     AUDIT_ROWS,
     INITIAL_GAIN_STD,
@@ -26,13 +26,13 @@ from calib.observer.config import (
     ObserverConfig,
     WindowSizes,
 )
-from calib.observer.decision import Agreeing, DriftFinding, Event, decide, verdict_evidence, windows_agree
+from calib.observer.decision import DriftFinding, Event, decide, verdict_evidence, windows_agree
 from calib.observer.discrepancy import DiscrepancyLevel
-from calib.observer.evidence import Belief, Verdict
+from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.motor_belief import MotorBelief
-from calib.observer.row_makers import MotionDetector, RestDetector, RowMaker
+from calib.observer.row_makers import MotionDetector, RestDetector
 from calib.observer.saved_values import UNREADABLE, restored
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
@@ -79,7 +79,7 @@ class Observer:
     def __init__(
         self,
         belief: Belief,
-        row_maker: RowMaker,
+        row_maker: RestDetector | MotionDetector,
         sizes: WindowSizes,
         config: ObserverConfig,
         angle: Callable[[Array], Array],
@@ -227,8 +227,7 @@ class Observer:
             again._accepted = as_array("accepted", values["accepted"], (n,)).astype(int)
             again._belief = restored(self._belief, values)
             again._alarms, again._row_maker = restored(self._alarms, values), restored(self._row_maker, values)
-            again._investigation = copy(self._investigation)
-            again._investigation.restore(values, again._cause_test)
+            again._investigation = restored(self._investigation, values)
         except UNREADABLE:
             return False
         again._limits = None
@@ -304,7 +303,7 @@ class Observer:
         if verdict.cause == "none" and state.reported and not test.denies(*state.reported, state.size):
             state.forget_oldest()
             return []  # these rows do not show the change that was found, nor that it is gone
-        if state.silent and not self._is_confirmed(test, verdict):
+        if state.silent and not self._is_confirmed(verdict):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window = state.window
@@ -326,13 +325,13 @@ class Observer:
         if not belief.of_sensors:
             return self._report(t, verdict)
         if not verdict.is_drift:
-            state.first = None
+            state.suspected, state.first = None, []
             return self._carried(t, verdict) or self._report(t, verdict)
         state.carrying = 0
         alarms = [self._event(t, "alarm", joint, channel=verdict.cause) for joint in verdict.joints if found]
         return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
-    def _is_confirmed(self, test: CauseTest, verdict: Verdict) -> bool:
+    def _is_confirmed(self, verdict: Verdict) -> bool:
         """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
         state = self._investigation
         if verdict.cause in ("none", "unknown", "ambiguous"):
@@ -341,7 +340,7 @@ class Observer:
             return False
         if self._is_repeated(verdict):
             return True
-        state.first = Agreeing(state.window, test, frozenset(verdict.joints)) if verdict.is_drift else None
+        state.first = state.window if verdict.is_drift else []
         state.next_window()
         return False
 
@@ -349,7 +348,7 @@ class Observer:
         """Whether the window before found the same."""
         state, sensors = self._investigation, self._belief.of_sensors
         before, cause = state.suspected, "drift" if sensors and verdict.is_drift else verdict.cause
-        state.suspected = (cause, verdict.joints)
+        state.suspected = (cause, tuple(sorted(verdict.joints)))
         return state.suspected == before
 
     def _carried(self, t: float, verdict: Verdict) -> list[Event]:
@@ -369,22 +368,21 @@ class Observer:
 
     def _confirm(self, t: float, window: list[StaticReading], test: CauseTest, verdict: Verdict) -> list[Event]:
         """A window found a drift: once the window before it agrees, decide on the rows of both."""
-        first, agreeing = self._investigation.first, Agreeing(window, test, frozenset(verdict.joints))
-        self._investigation.first = agreeing
+        first, self._investigation.first = self._investigation.first, window
         for joint in verdict.joints:
             self._set(joint, *test.drift(joint, verdict.cause, verdict.other(joint)))
-        if first is None or first.joints != agreeing.joints:
+        if not self._is_repeated(verdict) or not first:
             return []
+        before, joints = self._cause_test(first), set(verdict.joints)
         for joint in verdict.joints:
-            if not windows_agree(first.test, test, joint, verdict.other(joint)):
+            if not windows_agree(before, test, joint, verdict.other(joint)):
                 return self._undecided(
                     t, joint, "two windows of readings disagree, so the sensor may still be drifting"
                 )
-        rows = (first.rows + window)[-LONGEST_WINDOW:]
+        self._investigation.first = rows = (first + window)[-LONGEST_WINDOW:]
         together = self._cause_test(rows)
-        self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
-        if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
+        if not verdict.is_drift or set(verdict.joints) != joints:
             return self._undecided(
                 t,
                 None,
@@ -437,7 +435,7 @@ class Observer:
 
     def _set(self, joint: int, change: Array, covariance: Array) -> None:
         self._state, self._covariance = self._state.copy(), self._covariance.copy()
-        self._state[joint], self._covariance[joint] = (1.0, 0.0) + change, covariance
+        self._state[joint], self._covariance[joint] = np.array([1.0, 0.0]) + change, covariance
 
     def _resume(self) -> None:
         self._investigation.resume()

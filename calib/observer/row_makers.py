@@ -5,7 +5,7 @@ a joint moves, friction has a known sign.
 """
 
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -13,20 +13,6 @@ from calib.motion.static_reading import LEAST_SAMPLES, StaticReading, slope
 from calib.observer.config import LONGEST_GAP, ObserverConfig
 from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
-
-
-class RowMaker(Protocol):
-    """`handle` takes one sample ((n,) each, SI, temperatures in °C, NaN if missing), and returns the rows that it
-    completes."""
-
-    def handle(
-        self, t: float, position: Array, torque: Array, temperature: Array | None = None
-    ) -> list[StaticReading]: ...
-
-    def save(self) -> dict[str, Any]: ...
-
-    def restore(self, values: dict[str, Any]) -> None: ...
-
 
 NEW_POSE = 0.05
 """A stop counts as another one once some joint has moved this far [rad]: a long rest is one row."""
@@ -47,9 +33,8 @@ class RestDetector:
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
-    def handle(
-        self, t: float, position: Array, torque: Array, temperature: Array | None = None
-    ) -> list[StaticReading]:
+    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[StaticReading]:
+        """Take one sample ((n,) each, SI, temperatures in °C, NaN if missing); the row of this rest once complete."""
         config = self._config
         if np.isnan(position).any() or np.isnan(torque).any():
             return []
@@ -119,9 +104,8 @@ class MotionDetector:
         self._side = np.zeros(n)
         self._turned_at = np.full(n, np.nan)
 
-    def handle(
-        self, t: float, position: Array, torque: Array, temperature: Array | None = None
-    ) -> list[StaticReading]:
+    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[StaticReading]:
+        """Take one sample likewise; the rows of the stretch that it completes."""
         if not (np.isfinite(position).all() and np.isfinite(torque).all()):
             self._samples.clear()
             return []

@@ -196,7 +196,9 @@ def test_the_same_samples_give_the_same_events(sarcos, sarcos_beta) -> None:
 
 def test_position_gain_and_offset_are_applied(sarcos, sarcos_beta) -> None:
     gain, offset = np.full(7, 1.01), np.full(7, 0.02)
-    observer = Observer.at_rest(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA, None, lambda reading: gain * reading + offset)
+    observer = Observer.at_rest(
+        sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA, None, lambda reading: gain * reading + offset
+    )
     random = np.random.default_rng(0)
     for k in range(60):
         q = random.uniform(sarcos.lower, sarcos.upper)
