@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading
-from calib.observer.alarms import AlarmWatch
+from calib.observer.alarms import PLACE_ROWS, AlarmWatch
 from calib.observer.cause_test import Belief, CauseTest, DetectionLimits, cause_test, limits
 from calib.observer.config import (
     AUDIT_ROWS,
@@ -46,8 +46,6 @@ DISCREPANCY_SHARE = 5e-4
 """Discrepancy that is expected of an arm whose calibration tells nothing of it, as a share of rated torque."""
 PATIENCE = 2 * LONGEST_WINDOW
 """Repeated poses after an alarm after which the test is given up as undecided: as many as two longest windows have."""
-PLACE_ROWS = 3
-"""Rows of one pose that a window takes: a repeated pose adds no information."""
 IN_MOTION = WindowSizes(LONGEST_WINDOW, LONGEST_WINDOW, 2 * LONGEST_WINDOW, overlap=LONGEST_WINDOW)
 """A row of motion has one torque, a rest one of each joint. Of seven joints that creep in turn, 60 rows are 40 s."""
 DOUBTED = 2
@@ -158,9 +156,8 @@ class Observer:
         if isinstance(self._belief, GravityBelief) and not state.held:
             alarms = self._alarms.watch(row, self._belief)
             if alarms:
-                told = [alarm for alarm in alarms if alarm[0] == "alarm"]
-                state.start(silent=not told)
-                return [self._event(row.t, "alarm", joint, channel=channel) for _, joint, channel in told]
+                state.start()
+                return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
         if not state.add(row):
             return self._repeat(row.t)
         if not self.held:
@@ -332,7 +329,7 @@ class Observer:
         return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _is_confirmed(self, verdict: Verdict) -> bool:
-        """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
+        """Whether fresh rows twice find what an audit was about; nothing is told before."""
         state = self._investigation
         if verdict.cause in ("none", "unknown", "ambiguous"):
             if len(state.window) >= self._sizes.longest:
