@@ -51,7 +51,7 @@ CAUSES = {
 """Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
 
 Belief = GravityBelief | MotorBelief
-"""What is known of an arm from its records and from rows in which nothing had changed."""
+"""An arm as its records and the rows in which nothing had changed describe it."""
 
 
 def kin(entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:

@@ -1,4 +1,4 @@
-"""What a test of changes takes and what it answers: residuals, changes that may explain them, fits, verdicts."""
+"""Terms of a test of changes: residuals, hypotheses that may explain them, fits, verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field

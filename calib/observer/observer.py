@@ -49,9 +49,8 @@ PATIENCE = 2 * LONGEST_WINDOW
 IN_MOTION = WindowSizes(LONGEST_WINDOW, LONGEST_WINDOW, 2 * LONGEST_WINDOW, overlap=LONGEST_WINDOW)
 """A row of motion has one torque, a rest one of each joint. Of seven joints that creep in turn, 60 rows are 40 s."""
 DOUBTED = 2
-"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them.
-
-An alarm is open, or the first epoch of the reference."""
+"""Windows in a row that nothing explains until the discrepancy's level is adapted to them, or an open alarm is told so.
+"""
 NOISE_MEMORY = 200
 """Rows that the measured standard deviation is averaged over: known within 5 % by then."""
 STEADY, CHANCE = 8.0, 3.0
@@ -258,17 +257,9 @@ class Observer:
             if len(window) < sizes.window:
                 return []
             self._adapt(window[: -len(window) // 4])  # a change in the newest rows is not discrepancy
-        test = self._cause_test(window)
-        verdict = test.verdict()
         # longer than a change takes to fill the window; an alarm would be open if it were a contact
         patience = DOUBTED if belief.is_first else sizes.longest // sizes.audit + 1
-        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
-        lasting = state.doubtful >= patience
-        if lasting:
-            self._adapt(window)
-            test = self._cause_test(window)
-            verdict = test.verdict()
-            state.doubtful = state.doubtful if verdict.cause == "unknown" else 0
+        test, verdict = self._judge(window, patience)
         if verdict.cause == "none":
             self._learn(state.settled(belief.is_first))
             self._estimate(test)
@@ -279,7 +270,7 @@ class Observer:
             state.start(silent=True)
             if sizes.overlap:
                 self._is_repeated(verdict)
-        elif verdict.cause == "unknown" and lasting and not belief.is_first:
+        elif verdict.cause == "unknown" and state.doubtful >= patience and not belief.is_first:
             return self._report(t, verdict)
         return []
 
@@ -288,13 +279,8 @@ class Observer:
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state, belief, sizes = self._investigation, self._belief, self._sizes
-        test = self._cause_test(state.window)
-        # rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open
-        adapts = not belief.learnt or len(state.window) >= DOUBTED * sizes.window
-        if state.silent and test.verdict().cause == "unknown" and adapts:
-            self._adapt(state.window)
-            test = self._cause_test(state.window)
-        verdict = test.verdict()
+        # without an alarm that was told, rows that nothing explains show the discrepancy rather than a contact
+        test, verdict = self._judge(state.window, DOUBTED if state.silent else DOUBTED + 1)
         if verdict.cause == "ambiguous" and len(state.window) < sizes.longest:
             return []  # more rows may decide
         if verdict.cause == "none" and state.reported and not test.denies(*state.reported, state.size):
@@ -305,13 +291,8 @@ class Observer:
         found, state.silent = state.silent and verdict.is_drift, False
         window = state.window
         state.next_window()
-        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
         if state.doubtful == 1:
             return []  # the cause may have changed within this window: wait for another one
-        if state.doubtful > DOUBTED:  # it stays: another discrepancy than the one known
-            self._adapt(window)
-            test = self._cause_test(window)
-            verdict = test.verdict()
         if not belief.of_sensors:
             self._estimate(test)
             if verdict.cause == "ambiguous" or not self._is_repeated(verdict):
@@ -416,6 +397,18 @@ class Observer:
     def _cause_test(self, rows: list[StaticReading]) -> CauseTest:
         return cause_test(self._belief, rows)
 
+    def _judge(self, rows: list[StaticReading], patience: int) -> tuple[CauseTest, Verdict]:
+        """Test rows; that nothing explains so many windows in a row shows another discrepancy than the one known."""
+        state, test = self._investigation, self._cause_test(rows)
+        verdict = test.verdict()
+        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
+        if state.doubtful >= patience:
+            self._adapt(rows)
+            test = self._cause_test(rows)
+            verdict = test.verdict()
+            state.doubtful = state.doubtful if verdict.cause == "unknown" else 0
+        return test, verdict
+
     def _learn(self, rows: list[StaticReading]) -> None:
         if rows:
             self._belief.learn(rows)
@@ -479,7 +472,7 @@ def observer_of(
 
 
 def _of_motion(values: dict[str, Any], n: int) -> dict[str, Any]:
-    """What an observer in motion saved in its former format, as it is saved now."""
+    """The former format of an observer in motion as the present one."""
     cause, joint, size = values["reported"]
     if not (joint is None or 0 <= joint < n):
         raise ValueError(f"joint {joint} of {n}")
