@@ -26,7 +26,7 @@ from calib.observer.config import (
     ObserverConfig,
     WindowSizes,
 )
-from calib.observer.decision import DriftFinding, Event, decide, verdict_evidence, windows_agree
+from calib.observer.decision import WIDER, DriftFinding, Event, decide, verdict_evidence, windows_agree
 from calib.observer.discrepancy import DiscrepancyLevel
 from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
@@ -262,7 +262,8 @@ class Observer:
         test, verdict = self._judge(window, patience)
         if verdict.cause == "none":
             self._learn(state.settled(belief.is_first))
-            self._estimate(test)
+            if len(window) >= min(sizes.longest, self._accepted.max()):  # else an alarm or a write was not long ago
+                self._estimate(test)
             gone, state.reported = state.reported is not None, None
             return [self._verdict(t, verdict)] if gone else []
         state.forget_oldest()
@@ -420,8 +421,10 @@ class Observer:
 
     def _estimate(self, test: CauseTest) -> None:
         """Gains and offsets of all joints as the rows of a test have them."""
+        wider = 1 + WIDER * test.known.of_model
         for joint in range(self.arm.n):
-            self._set(joint, *test.sensor(joint))
+            change, covariance = test.sensor(joint)
+            self._set(joint, change, wider[joint] * covariance)
 
     def _set(self, joint: int, change: Array, covariance: Array) -> None:
         self._state, self._covariance = self._state.copy(), self._covariance.copy()
