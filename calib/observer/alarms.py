@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading, stack
-from calib.observer.config import LONGEST_WINDOW, PLACE_SIZE, ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, PLACE_SIZE, ObserverConfig
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
 from gcomp.arrays import Array, as_array
@@ -45,10 +45,6 @@ class Cusum:
         self.sums = np.maximum(0.0, self.sums + ratio)
         self._rising = np.where(self.sums > 0.0, self._rising + 1, 0)
         return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self.sums > ALARM_THRESHOLD)]
-
-    def is_open(self) -> bool:
-        """Whether a channel is in alarm."""
-        return bool((self.sums > ALARM_THRESHOLD).any())
 
     def reset(self) -> None:
         self.sums, self._rising = np.zeros_like(self.sums), np.zeros_like(self._rising)
@@ -140,7 +136,10 @@ class PoseMemory:
 
 DOUBT = 4.0
 """An alarm is one at once if its log-likelihood ratio is this many times larger than needed, where the model's error is
-all there is beside it; else it is left to the cause test of other rows."""
+all there is beside it; else it is first confirmed."""
+
+Alarm = tuple[str, int, str]
+"""Kind (alarm or suspicion), joint, channel."""
 
 
 class AlarmWatch:
@@ -149,10 +148,12 @@ class AlarmWatch:
     def __init__(self, n: int, config: ObserverConfig) -> None:
         self._cusum = Cusum(n, config)
         self._poses = PoseMemory(n)
+        self._suspected = 0
+        """Rows for which there has been a suspicion: it may yet become an alarm."""
         self._since: deque[tuple[StaticReading, bool]] = deque(maxlen=config.window)
 
-    def watch(self, row: StaticReading, belief: GravityBelief) -> list[tuple[int, str]]:
-        """Take a row while no alarm is open; returns joints and channels in alarm."""
+    def watch(self, row: StaticReading, belief: GravityBelief) -> list[Alarm]:
+        """Take a row while no alarm is open."""
         q, noise = row.position, belief.sigma**2
         expected = belief.expected(q[None], row.direction[None], row.temperature[None])
         torque = expected.torque[0]
@@ -161,16 +162,11 @@ class AlarmWatch:
         self._since.append((row, self._poses.seen(q) >= PLACE_ROWS))
         if not belief.level.is_known:
             return []
-        alarms, certain = self._cusum.handle(residual - here, torque, noise + left), list[tuple[int, str]]()
-        for alarm in alarms:
-            evidence, needed = self._evidence(*alarm, belief)
-            if evidence <= 1.0:
-                self._cusum.drop(*alarm)
-            elif evidence > needed:
-                certain.append(alarm)
-        if not self._cusum.is_open():
-            self._poses.add(q, residual)
-        return certain
+        alarms = self._cusum.handle(residual - here, torque, noise + left)
+        if alarms and (told := self._judged(alarms, belief)) is not None:
+            return told
+        self._poses.add(q, residual)
+        return []
 
     def forget_poses(self) -> None:
         """Another calibration, or another model, is in use."""
@@ -180,13 +176,29 @@ class AlarmWatch:
         """The alarm is closed: change detection starts from zero."""
         self._cusum.reset()
         self._since.clear()
+        self._suspected = 0
 
-    def _evidence(self, joint: int, channel: str, belief: GravityBelief) -> tuple[float, float]:
-        """How clearly the rows since a channel began to rise show its change beyond the model's own, correlated error,
-        and how clearly an alarm must; up to 1 they do not."""
+    def _judged(self, alarms: list[tuple[int, str]], belief: GravityBelief) -> list[Alarm] | None:
+        """Alarms of the CUSUM to tell now, none while they are open; None if all were the model's error."""
+        found = [(self._seen_as(*alarm, belief), *alarm) for alarm in alarms]
+        for kind, joint, channel in found:
+            if not kind:
+                self._cusum.drop(joint, channel)
+        seen = [alarm for alarm in found if alarm[0]]
+        self._suspected = self._suspected + 1 if seen else 0
+        certain = [alarm for alarm in seen if alarm[0] == "alarm"]
+        if certain or self._suspected >= AUDIT_ROWS:
+            return certain or seen
+        return [] if seen else None
+
+    def _seen_as(self, joint: int, channel: str, belief: GravityBelief) -> str:
+        """Whether the rows since a channel began to rise show its change beyond the model's own, correlated error.
+
+        "alarm" if they do without doubt, "suspicion" if other rows must confirm it, "" if they do not.
+        """
         latest = list(self._since)[-self._cusum.rising(joint, channel) :]
         if 2 * sum(known for _, known in latest) > len(latest):
-            return np.inf, 1.0  # at places whose error is known
+            return "alarm"  # at places whose error is known
         rows, noise = [row for row, _ in latest], belief.sigma[joint] ** 2
         expected = belief.expected(*(stack(rows, name) for name in ("position", "direction", "temperature")))
         torque = expected.torque[:, joint]
@@ -195,15 +207,18 @@ class AlarmWatch:
         change = torque if channel.startswith("gain") else np.ones_like(torque)
         weight = np.linalg.solve(covariance, change)
         of_model = 1 - noise * len(rows) / float(np.trace(covariance))
-        return float((weight @ residual) ** 2 / (weight @ change)) / (2 * ALARM_THRESHOLD), 1 + DOUBT * of_model
+        shown = float((weight @ residual) ** 2 / (weight @ change)) / (2 * ALARM_THRESHOLD)
+        if shown <= 1:
+            return ""
+        return "alarm" if shown > 1 + DOUBT * of_model else "suspicion"
 
     def save(self) -> dict[str, Any]:
         saved = save_rows([row for row, _ in self._since])
         since = [[*row[:4], known, *row[4:]] for row, (_, known) in zip(saved, self._since, strict=True)]
-        return {"since": since} | self._cusum.save() | self._poses.save()
+        return {"since": since, "suspected_rows": self._suspected} | self._cusum.save() | self._poses.save()
 
     def restore(self, values: dict[str, Any]) -> None:
-        saved = values.get("since", [])
+        saved, self._suspected = values.get("since", []), int(values.get("suspected_rows", 0))
         rows = read_rows([[*row[:4], *row[5:]] for row in saved], len(self._cusum.sums))
         self._since = deque(zip(rows, (bool(row[4]) for row in saved), strict=True), maxlen=self._since.maxlen)
         self._cusum, self._poses = restored(self._cusum, values), restored(self._poses, values)

@@ -155,8 +155,9 @@ class Observer:
         if isinstance(self._belief, GravityBelief) and not state.held:
             alarms = self._alarms.watch(row, self._belief)
             if alarms:
-                state.start()
-                return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
+                told = [alarm for alarm in alarms if alarm[0] == "alarm"]
+                state.start(silent=not told)
+                return [self._event(row.t, "alarm", joint, channel=channel) for _, joint, channel in told]
         if not state.add(row):
             return self._repeat(row.t)
         if not self.held:
@@ -311,7 +312,7 @@ class Observer:
         return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _is_confirmed(self, verdict: Verdict) -> bool:
-        """Whether fresh rows twice find what an audit was about; nothing is told before."""
+        """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
         state = self._investigation
         if verdict.cause in ("none", "unknown", "ambiguous"):
             if len(state.window) >= self._sizes.longest:
