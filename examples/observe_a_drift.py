@@ -15,7 +15,7 @@ from sim_bus.bus.lock_step import LockStepBus
 arm = load_arm(str(Path(__file__).with_name("planar3.yaml")))
 kinematics, bus = gcomp_arm(arm), LockStepBus(str(arm.path))
 beta = np.array([2.1991, 0.0397, 0.8198, -0.0505, 0.0959, 0.0238])  # kg·m, as calibrate_and_identify.py prints them
-observer = Observer(kinematics, beta, np.diag(np.full(6, 0.002**2)), sigma=np.array([0.08, 0.03, 0.01]))  # N·m
+observer = Observer.at_rest(kinematics, beta, np.diag(np.full(6, 0.002**2)), sigma=np.array([0.08, 0.03, 0.01]))  # N·m
 
 with Link(arm, bus) as link:
     link.start()

@@ -180,6 +180,24 @@ class StaticReading:
         sides = np.zeros(n) if direction is None else direction
         return cls(**{**held, **nothing, **known}, t=t, position=position, torque=torque, direction=sides)
 
+    @classmethod
+    def of_motion(
+        cls, t: float, joint: int, position: Array, torque: float, velocity: float, temperature: float
+    ) -> "StaticReading":
+        """A reading of one joint at a steady velocity [rad/s], the torque [N·m] of its own motor alone; its drive's
+        temperature [°C] is NaN if it is not known."""
+        own = np.arange(len(position)) == joint
+        return cls.of(
+            t,
+            position,
+            np.where(own, torque, np.nan),
+            own * np.sign(velocity),
+            joint=joint,
+            servo=np.zeros(len(position), dtype=bool),
+            speed=abs(velocity),
+            temperature=np.where(own, temperature, np.nan),
+        )
+
     def within(self, sweep: str, index: int, servo: Mask, joint: int | None = None, direction: int = 0) -> Self:
         """The same as reading `index` of a sweep of `joint`, approached in `direction`, `servo` (n,) joints held."""
         return replace(self, sweep=sweep, index=index, servo=servo, joint=joint, direction=np.array(direction))
@@ -200,7 +218,8 @@ def batch(readings: Sequence[StaticReading], sigma: ArrayLike) -> StaticReadings
     """Readings as a batch; `sigma` (K, n), (n,) or a number is the standard deviation of a torque [N·m]."""
     torque = np.where(stack(readings, "counted"), stack(readings, "torque"), np.nan)
     made = StaticReadings.of(stack(readings, "position"), torque, sigma)
-    return replace(made, direction=stack(readings, "direction"))
+    speed = np.array([each.speed or 0.0 for each in readings])[:, None]
+    return replace(made, direction=stack(readings, "direction"), velocity=speed * stack(readings, "direction"))
 
 
 def slope(t: Array, values: Array) -> Array:

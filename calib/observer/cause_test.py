@@ -1,29 +1,41 @@
-"""The cause test: which single effect explains a window's torque residual, if any (docs/theory.md, section 6)."""
+"""The cause test: which single effect explains the torque residuals of a window of rows, if any.
 
-from collections.abc import Iterator
+Generalised least squares of each candidate, with the belief's own doubt in the covariance; candidates compete by BIC
+(docs/theory.md, section 6).
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from functools import cached_property
+from itertools import combinations, pairwise, product
 
 import numpy as np
 
-from calib.fit.calibration import VERY_STRONG_EVIDENCE
-from calib.observer.config import LONGEST_WINDOW, ObserverConfig
-from calib.observer.evidence import DRIFT, ChangeFit, ChangeHypothesis, ResidualTest, Verdict
+from calib.fit.calibration import NOISE_ROUNDS, VERY_STRONG_EVIDENCE
+from calib.motion.static_reading import StaticReading, batch, stack
+from calib.observer.config import WindowSizes
+from calib.observer.evidence import (
+    DRIFT,
+    INEXACT,
+    ChangeFit,
+    ChangeHypothesis,
+    Verdict,
+    decomposed,
+    smallest_noticed_change,
+    span,
+)
 from calib.observer.gravity_belief import GravityBelief
-from gcomp.arm.arm import Arm
-from gcomp.arm.mass_moments import payload_columns
+from calib.observer.motor_belief import MotorBelief
 from gcomp.arrays import Array
-from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_stiffness
+from gcomp.estimate.posterior import linear_posterior
+from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.readings import StaticReadings
 
+AGREEMENT = 13.8
+"""Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with 2 degrees
+of freedom, once in 1000 (docs/theory.md, section 6)."""
 OF_AN_ARM = ("friction", "spring", "slip", "tilt", "scale")
 """Causes that a discrepancy consists of: as small as its level they are not told."""
-INEXACT = 0.02
-"""Most that an effect's own shape may be off, as a share: it is as inexact as the gravity model's torque."""
-LEVEL_ROWS = 10
-"""Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
-MISFIT = 4.0
-"""(χ² − dof)/√(2 dof) above which no entry explains the window (docs/theory.md, section 6)."""
 
 CAUSES = {
     "gain": ("torque.gain",),
@@ -38,73 +50,43 @@ CAUSES = {
 }
 """Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
 
-
-def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[ChangeHypothesis]:
-    """Every entry of the dictionary for the true angles of a window; beta (2n,) [kg·m] is the present gravity model."""
-    q, n = window.position, arm.n
-    regressor = gravity_regressor(arm, q)
-    torque = regressor @ beta
-    middle = np.where(np.isfinite(arm.lower + arm.upper), (arm.lower + arm.upper) / 2, 0.0)
-    one = np.ones(len(q))
-
-    def row_of(joint: int, *columns: Array) -> Array:
-        full = np.zeros((len(q), n, len(columns)))
-        full[:, joint] = np.stack(columns, axis=1)
-        return full.reshape(len(q) * n, len(columns))
-
-    for j in range(n):
-        yield ChangeHypothesis("gain", j, row_of(j, torque[:, j]))
-        yield ChangeHypothesis("offset", j, row_of(j, one))
-        yield ChangeHypothesis("drift", j, row_of(j, torque[:, j], one))
-        yield ChangeHypothesis("friction", j, row_of(j, window.direction[:, j]))
-        yield ChangeHypothesis("spring", j, row_of(j, q[:, j] - middle[j], one))
-    stiffness = gravity_stiffness(arm, beta, q)
-    for j in range(n):
-        yield ChangeHypothesis("slip", j, stiffness[:, :, j].reshape(-1, 1))
-    yield ChangeHypothesis("payload", None, (regressor @ np.column_stack(payload_columns(arm))).reshape(-1, 4))
-    across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
-    tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
-    yield ChangeHypothesis("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
-    # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
-    yield ChangeHypothesis("scale", None, torque.reshape(-1, 1), price=4)
-
-
-def class_of(entry: ChangeHypothesis) -> str:
-    """Class of an entry in the comparison of verdicts: gain, offset and both of one joint are one class."""
-    cause = "drift" if entry.cause in DRIFT else entry.cause
-    return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
+Belief = GravityBelief | MotorBelief
+"""An arm as its records and the rows in which nothing had changed describe it."""
 
 
 def kin(entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:
     """Whether an entry is not a rival: it is of the same class, or the winner is a special case of it."""
     special = entry.joint == winner.joint and set(CAUSES[winner.cause]) < set(CAUSES[entry.cause])
-    return class_of(entry) == class_of(winner) or special
+    return entry.class_name == winner.class_name or special
+
+
+def cause_test(belief: Belief, rows: Sequence[StaticReading]) -> "CauseTest":
+    """The test of these rows, by the belief from rows before them."""
+    return CauseTest(belief.before(rows[0].position), batch(rows, belief.sigma), stack(rows, "temperature"))
 
 
 class CauseTest:
-    """The dictionary fitted to one window, with model error marginalised: the belief's covariance and σ²I."""
+    """Every change that the belief knows, fitted to one window, with the model's error marginalised."""
 
-    def __init__(self, belief: GravityBelief, window: StaticReadings, temperature: Array | None = None) -> None:
+    def __init__(self, belief: Belief, window: StaticReadings, temperature: Array | None = None) -> None:
         """Of K rows with true angles, torques as installed, their standard deviations, temperatures (K, n) if told."""
         self.belief, self.window = belief, window
-        expected = belief.expected(window.position, window.direction, temperature)
-        residual = window.torque - expected.torque - expected.mean
-        covariance = expected.covariance.copy()
-        covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
-        noise = (window.sigma**2).mean(axis=0)
-        self.of_model: Array = 1 - noise / (noise + expected.variance.mean(axis=0))
-        """Share of the model's own error in the variance of each joint's residuals (n,)."""
-        self.found = ResidualTest(residual.ravel(), covariance, list(dictionary(belief.arm, belief.beta, window)))
-        discrepancy = float(np.median(belief.level.total / belief.kernel.typical)) if belief.level.total.any() else 0.0
-        self._inexact = min(discrepancy, INEXACT)
+        self.known = known = belief.residuals(window, temperature)
+        self.hypotheses = known.hypotheses
+        self._root = np.linalg.cholesky(known.covariance)
+        white = self._whitened(np.column_stack([known.residual, *(each.columns for each in self.hypotheses)]))
+        self._residual: Array = white[:, 0]
+        ends = np.cumsum([1, *(each.columns.shape[1] for each in self.hypotheses)])
+        self._columns: list[Array] = [white[:, begin:end] for begin, end in pairwise(ends)]
+        self._chi2 = float(self._residual @ self._residual)
+        """Where nothing has changed."""
 
     def verdict(self) -> Verdict:
         """The winning class, or why none wins."""
-        fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
-        best = fits[0]
-        classes = {"none": self.found.chi2}
+        fits = sorted(map(self._fit, range(len(self.hypotheses))), key=lambda fit: fit.bic)
+        classes = {"none": self._chi2}
         for fit in reversed(fits):
-            classes[class_of(fit.hypothesis)] = fit.bic
+            classes[fit.hypothesis.class_name] = fit.bic
         top = min(classes.values())
         weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
         total = sum(weights.values())
@@ -117,17 +99,18 @@ class CauseTest:
             joint = fit.hypothesis.joint if fit else None
             return Verdict(cause, joint, float(weights[of] / total), *known, evidence, rivals)
 
-        if self.found.chi2 - best.bic < VERY_STRONG_EVIDENCE:
-            misfit = self._misfit(self.found.chi2, 0)
+        if not fits or self._chi2 - fits[0].bic < VERY_STRONG_EVIDENCE:
+            misfit = self._misfit(self._chi2, 0)
             evidence["misfit"] = misfit
-            return answer("unknown" if misfit > MISFIT else "none", None, "none")
-        winner, name = best.hypothesis, class_of(best.hypothesis)
-        inexact = self._inexact**2 * (self.found.chi2 - best.chi2)
+            return answer("unknown" if misfit > self.belief.misfit_limit else "none", None, "none")
+        best = fits[0]
+        winner, name = best.hypothesis, best.hypothesis.class_name
+        inexact = min(float(np.median(self.known.relative_level)), INEXACT) ** 2 * (self._chi2 - best.chi2)
         evidence["misfit"] = self._misfit(best.chi2 - inexact, winner.columns.shape[1])
-        if evidence["misfit"] > MISFIT or (winner.cause == "payload" and not self._weighs(best)):
+        if evidence["misfit"] > self.belief.misfit_limit or (winner.cause == "payload" and not self._weighs(best)):
             return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
         near = [fit.hypothesis for fit in fits[1:] if fit.bic - best.bic < VERY_STRONG_EVIDENCE]
-        rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
+        rivals = tuple(dict.fromkeys(entry.class_name for entry in near if not kin(entry, winner)))
         sensor_or_load = any(entry.cause in (*DRIFT, "payload") for entry in near)
         if winner.cause in OF_AN_ARM and not sensor_or_load and self._is_small(best):
             return answer("none", None, "none")
@@ -135,10 +118,80 @@ class CauseTest:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)
 
-    def _is_small(self, fit: ChangeFit) -> bool:
-        """Whether an effect is no larger than the arm's discrepancy anyway: twice its level at each joint."""
-        size = (fit.hypothesis.columns @ fit.values).reshape(-1, self.belief.arm.n)
-        return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * self.belief.level.total).all())
+    def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
+        """Change of a joint's gain and offset (2,) under `cause` (gain, offset or drift), and covariance (2, 2).
+
+        If the joint `beside` drifts too, both are fitted together.
+        """
+        fit = self._drift_fit(joint, cause, beside)
+        at = [index for index, name in enumerate(("gain", "offset")) if cause in (name, "drift")]
+        values, covariance = np.zeros(2), np.zeros((2, 2))
+        values[at] = fit.values[: len(at)]
+        covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
+        return values, covariance
+
+    def sensor(self, joint: int) -> tuple[Array, Array]:
+        """Change of a joint's gain and offset (2,) [1, N·m], fitted together, and their covariance (2, 2).
+
+        Drawn towards nothing where the rows tell little.
+        """
+        std = self.belief.change_std
+        places = [self._index(cause, joint) for cause in ("gain", "offset")]
+        columns = np.zeros((len(self._residual), 2))
+        for place, index in enumerate(places):
+            if index is not None:
+                columns[:, [place]] = self._columns[index]
+        fit = linear_posterior(columns, self._residual, np.zeros(2), std)
+        return fit.x, fit.covariance
+
+    def denies(self, cause: str, joints: tuple[int, ...], values: Array) -> bool:
+        """Whether these rows show that an earlier change of these values is there no more."""
+        own = self._index(cause, joints[0] if joints else None)
+        if own is None:
+            return cause not in CAUSES or not joints
+        fit = self._fit(own)
+        if fit.values.shape != values.shape or not np.isfinite(fit.bic):
+            return True
+        known = np.diag(fit.covariance) > 0
+        away = (fit.values - values)[known]
+        apart = float(away @ np.linalg.pinv(fit.covariance[np.ix_(known, known)]) @ away)
+        return bool(apart > AGREEMENT + 2 * known.sum())
+
+    def noticed(self, cause: str, joint: int) -> float:
+        """Size of a change of one parameter that wins in one case of two: over "none", and over every rival; NaN if no
+        row tells it."""
+        index, entries = self._index(cause, joint), self.hypotheses
+        if index is None:
+            return float("nan")
+        rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
+        bases = ((self._bases[rival], entries[rival].parameters) for rival in rivals)
+        return smallest_noticed_change(self._columns[index][:, 0], bases, VERY_STRONG_EVIDENCE)
+
+    def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
+        """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""
+        return self._drift_fit(joint, simple, beside).bic - self._drift_fit(joint, full, beside).bic
+
+    def lever_share(self, joint: int) -> float:
+        """Largest Γ_j/g in the window: gravity's lever on the joint as a share of g."""
+        levers = gravity_levers(self.belief.arm, self.window.position)[:, joint]
+        return float(levers.max() / np.linalg.norm(self.belief.arm.gravity))
+
+    def _whitened(self, columns: Array) -> Array:
+        return np.linalg.solve(self._root, columns)  # scipy takes longer to load
+
+    @cached_property
+    def _bases(self) -> list[Array]:
+        return [span(columns) for columns in self._columns]
+
+    def _index(self, cause: str, joint: int | None) -> int | None:
+        """Number of a hypothesis; None where there is none."""
+        known = [(each.cause, each.joint) for each in self.hypotheses]
+        return known.index((cause, joint)) if (cause, joint) in known else None
+
+    def _drift_fit(self, joint: int, cause: str, beside: int | None) -> ChangeFit:
+        wanted = [(cause, joint)] if beside is None else [(cause, joint), ("drift", beside)]
+        known = [(each.cause, each.joint) for each in self.hypotheses]
+        return self._fit(*map(known.index, wanted))
 
     def _fit(self, *indices: int) -> ChangeFit:
         """Generalised least squares of entries together; columns that are collinear at these poses never win.
@@ -146,34 +199,52 @@ class CauseTest:
         But for a payload: of an arm with parallel axes no lever may show its mass, or where it is along them. These
         parameters come with variance 0.
         """
-        fit, entries = self.found.fit(*indices), [self.found.hypotheses[index] for index in indices]
+        entries = [self.hypotheses[index] for index in indices]
+        columns = np.hstack([self._columns[index] for index in indices])
+        fit = _least_squares(entries, columns, self._residual)
+        about = entries[0].about if len(entries) == 1 else None
+        for _ in range(0 if about is None else NOISE_ROUNDS):
+            assert about is not None
+            white = self._whitened(np.column_stack(about(fit.values)))
+            change = _least_squares(entries, white[:, 1:], white[:, 0])
+            fit = replace(change, values=fit.values + change.values)
         count = len(fit.values)
         payload = [entry.cause for entry in entries] == ["payload"]
-        if fit.shown and (fit.shown == count or (payload and fit.shown == self.belief.kernel.payload_rank)):
+        if fit.shown and (fit.shown == count or (payload and fit.shown >= self.belief.payload_rank)):
             return fit
         unknown = np.full((count, count), np.nan)
         return ChangeFit(entries[0], np.inf, np.inf, unknown[0], unknown, fit.shown)
+
+    def _is_small(self, fit: ChangeFit) -> bool:
+        """Whether an effect is no larger than the arm's discrepancy anyway: twice its level at each joint."""
+        level = self.known.level
+        if not level.any():
+            return False
+        size = (fit.hypothesis.columns @ fit.values).reshape(-1, len(level))
+        return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * level).all())
 
     def _two_drifts(self) -> Verdict | None:
         """Two joints that drift at once, if that alone explains the window; else None.
 
         Competes with the drift of one joint together with an effect on the whole arm, such as a payload picked up.
         """
-        entries = self.found.hypotheses
+        entries = self.hypotheses
         whole = [index for index, entry in enumerate(entries) if entry.joint is None]
         drifts = [index for index, entry in enumerate(entries) if entry.cause == "drift"]
         drifts.sort(key=lambda index: self._fit(index).chi2)
-        pairs = [*combinations(drifts, 2), *product(drifts, whole)]
-        fits = {pair: self._fit(*pair) for pair in pairs}
+        fits = {pair: self._fit(*pair) for pair in (*combinations(drifts, 2), *product(drifts, whole))}
+        if not fits:
+            return None
         best = min(fits, key=lambda pair: fits[pair].bic)
         fit = fits[best]
-        if not np.isfinite(fit.bic) or self._misfit(fit.chi2, 4) > MISFIT or best[1] in whole:
+        misfit = self._misfit(fit.chi2, 4) if np.isfinite(fit.bic) else np.inf
+        if misfit > self.belief.misfit_limit or best[1] in whole:
             return None
         above = np.array([other.bic - fit.bic for pair, other in fits.items() if pair != best])
         if above.min() < VERY_STRONG_EVIDENCE:
             return None
         confidence = float(1 / (1 + np.exp(-above / 2).sum()))
-        evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
+        evidence = {"next": round(float(above.min()), 1), "misfit": misfit}
         first, second = (entries[index].joint for index in best)
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
 
@@ -184,47 +255,34 @@ class CauseTest:
 
     def _all_zeros(self) -> Verdict | None:
         """The zeros of several sensors moved together, as temperature moves them, if that alone explains the window."""
-        zeros = [self.found.index("offset", joint) for joint in range(self.belief.arm.n)]
+        if not self.belief.of_sensors:
+            return None
+        zeros = [index for index, entry in enumerate(self.hypotheses) if entry.cause == "offset"]
         fit = self._fit(*zeros)
-        misfit = self._misfit(fit.chi2, len(zeros))
-        if not np.isfinite(fit.bic) or misfit > MISFIT:
+        misfit = self._misfit(fit.chi2, len(zeros)) if np.isfinite(fit.bic) else np.inf
+        if misfit > self.belief.misfit_limit:
             return None
         return Verdict("temperature", None, 1.0, fit.values, fit.covariance, {"misfit": misfit})
 
-    def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
-        """Change of a joint's gain and offset (2,) under `cause` (gain, offset or drift), and covariance (2, 2).
-
-        If the joint `beside` drifts too, both are fitted together.
-        """
-        also = [] if beside is None else [self.found.index("drift", beside)]
-        fit = self._fit(self.found.index(cause, joint), *also)
-        at = [index for index, name in enumerate(("gain", "offset")) if cause in (name, "drift")]
-        values, covariance = np.zeros(2), np.zeros((2, 2))
-        values[at] = fit.values[: len(at)]
-        covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
-        return values, covariance
-
-    def noticed(self, cause: str, joint: int) -> float:
-        """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""
-        index, entries = self.found.index(cause, joint), self.found.hypotheses
-        rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
-        return self.found.noticed(index, rivals, VERY_STRONG_EVIDENCE)
-
-    def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
-        """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""
-        also = [] if beside is None else [self.found.index("drift", beside)]
-        less, more = (self._fit(self.found.index(cause, joint), *also).bic for cause in (simple, full))
-        return less - more
-
-    def lever_share(self, joint: int) -> float:
-        """Largest Γ_j/g in the window: gravity's lever on the joint as a share of g."""
-        levers = gravity_levers(self.belief.arm, self.window.position)[:, joint]
-        return float(levers.max() / np.linalg.norm(self.belief.arm.gravity))
-
     def _misfit(self, chi2: float, parameters: int) -> float:
-        level = self.belief.level
-        doubt = len(self.window.position) / (level.rows + LEVEL_ROWS) if level.total.any() else 0.0
-        return self.found.misfit(chi2, parameters, doubt)
+        """χ² above its degrees of freedom, in standard deviations."""
+        free = max(len(self._residual) - parameters, 1)
+        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + self.known.doubt))), 2)
+
+
+def _least_squares(together: Sequence[ChangeHypothesis], columns: Array, target: Array) -> ChangeFit:
+    """Hypotheses fitted together: whitened columns (K, p) to a whitened target (K,)."""
+    u, s, vt, size = decomposed(columns)
+    kept = s > 0
+    back = (vt[kept].T / s[kept]) / size[:, None]
+    explained = u[:, kept].T @ target
+    covariance, shown = back @ back.T, int(kept.sum())
+    hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
+    covariance[hidden] = covariance[:, hidden] = 0.0
+    chi2 = float(target @ target) - float(explained @ explained)
+    price = sum(each.parameters for each in together) - (columns.shape[1] - shown)
+    bic = chi2 + price * float(np.log(len(target)))
+    return ChangeFit(together[0], bic, chi2, back @ explained, covariance, shown)
 
 
 @dataclass(frozen=True)
@@ -236,17 +294,17 @@ class DetectionLimits:
     offset: Array
     """(n,) [N·m]."""
     rests: int
-    """Rests at other poses after which they are noticed."""
+    """Rows (rests at other poses) after which they are noticed."""
 
 
-def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimits:
-    """Limits in work at poses like those of a test.
+def limits(test: CauseTest, sizes: WindowSizes, wait: int) -> DetectionLimits:
+    """Limits in work like that of a test.
 
     A change is noticed if it stands out of a window of the longest kind, by the rule of the cause test, and rows after
-    it confirm it. `wait` is the number of rests until the first test.
+    it confirm it. `wait` is the number of rows until the first test.
     """
     count, n = test.window.position.shape
-    longer = np.sqrt(LONGEST_WINDOW / count)
+    longer = np.sqrt(sizes.longest / count)
     gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
     gain[~(gain <= 1.0)] = np.nan  # gravity hardly loads the joint: not even a gain of 0 would be noticed
-    return DetectionLimits(gain, offset, wait + LONGEST_WINDOW + 2 * config.window)
+    return DetectionLimits(gain, offset, wait + sizes.longest + 2 * sizes.window)

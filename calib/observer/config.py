@@ -5,6 +5,7 @@ reason given, and tests/campaigns/daemon_days.py bounds the result: time to find
 payloads recognised, no write in quiet work.
 """
 
+from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field, FiniteFloat
@@ -25,6 +26,22 @@ LONGEST_WINDOW = 60
 that show whether a gain can be told, and poses remembered."""
 PLACE_SIZE = 0.2
 """Poses within this distance in every joint count as one pose, and rows of a joint as neighbours [rad]."""
+
+
+@dataclass(frozen=True)
+class WindowSizes:
+    """Numbers of rows."""
+
+    window: int
+    """Of one test under an alarm."""
+    audit: int
+    """Between tests while there is no alarm."""
+    longest: int
+    """Kept for a test without an alarm, or for one that is ambiguous."""
+    overlap: int = 0
+    """Of a window that the next one has too."""
+    at_a_place: int | None = None
+    """Of one pose that count; None: all."""
 
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -61,8 +78,7 @@ class ObserverConfig(Section):
     tool_windows: RowCount = 60
     """Consecutive windows that find the same payload until it counts as a tool: half an hour of stops."""
     gain_std: NotNegative = 3e-3
-    """A gain is written, and followed by the filter, only if the rows determine it to this standard deviation: 0.3 %
-    (§6)."""
+    """A gain is written only if the rows determine it to this standard deviation: 0.3 % (§6)."""
     offset_std: NotNegative = 0.02
     """An offset is written only if its standard deviation is smaller [N·m] (§6)."""
     rest_between_writes: NotNegative = 60.0

@@ -7,16 +7,12 @@ import numpy as np
 
 from armlink.torque_calibration import TorqueCalibration
 from calib.fit.calibration import SIGNIFICANCE, VERY_STRONG_EVIDENCE
-from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest
+from calib.observer.cause_test import AGREEMENT, CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.evidence import Verdict
 from gcomp.arrays import Array
 from gcomp.design.selection import MINIMUM_LEVER
 
-AGREEMENT = 13.8
-"""Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with 2 degrees
-of freedom, once in 1000 (docs/theory.md, section 6)."""
 COMMON_JOINTS = 3
 """If this many joints drift by the same factor, suspect gravity, payload or supply voltage, and write none
 (likewise)."""
@@ -70,13 +66,6 @@ class DriftFinding:
         return cls(**{**values, "covariance": np.array(values["covariance"])})
 
 
-@dataclass(frozen=True)
-class Agreeing:
-    rows: list[StaticReading]
-    test: CauseTest
-    joints: frozenset[int]
-
-
 def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int | None) -> bool:
     """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
 
@@ -93,12 +82,12 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids a write."""
     cause, refused = verdict.cause, []
     beside = verdict.other(joint)
-    wider = 1 + WIDER * float(test.of_model[joint])
+    wider = 1 + WIDER * float(test.known.of_model[joint])
     change, covariance = test.drift(joint, cause, beside)
     weak_lever = test.lever_share(joint) < MINIMUM_LEVER
-    of_model = test.belief.level.total[joint]  # no worse than what the arm has anyway
-    gain_std = float(np.hypot(config.gain_std, of_model / test.belief.kernel.typical[joint]))
-    offset_std = float(np.hypot(config.offset_std, of_model))
+    # no worse than what the arm has anyway
+    gain_std = float(np.hypot(config.gain_std, test.known.relative_level[joint]))
+    offset_std = float(np.hypot(config.offset_std, test.known.level[joint]))
     if cause != "offset" and (weak_lever or covariance[0, 0] > gain_std**2):
         std = (
             f"the gain is known only to ± {np.sqrt(covariance[0, 0]):.2%}, but ± {gain_std:.2%} is required: "
@@ -155,7 +144,7 @@ def _joints_alike(test: CauseTest, joint: int) -> int:
 
 @dataclass(frozen=True)
 class Event:
-    """One event. `kind`: alarm, outliers, verdict, proposal or undecided."""
+    """One event. `kind`: alarm, verdict, proposal or undecided."""
 
     t: float
     kind: str

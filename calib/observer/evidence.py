@@ -1,9 +1,7 @@
-"""Which of several changes explains residuals: least squares of each, compared by BIC (docs/theory.md, section 6)."""
+"""Terms of a test of changes: residuals, hypotheses that may explain them, fits, verdicts."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -11,6 +9,8 @@ from gcomp.arrays import Array
 
 DRIFT = ("gain", "offset", "drift")
 """Causes that are a drift of a torque sensor: of gain, of offset, or both."""
+INEXACT = 0.02
+"""Most that an effect's own shape may be off, as a share: it is as inexact as the gravity model's torque."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,39 @@ class ChangeHypothesis:
     """Change of the K residuals per unit of each parameter (K, p)."""
     price: int | None = None
     """Parameters charged in the BIC; by default the number of columns."""
+    family: str | None = None
+    """Causes of one joint that count as one in the comparison of verdicts; by default the cause alone."""
+    about: Callable[[Array], tuple[Array, Array]] | None = None
+    """(Residuals, columns) about values of the parameters, of a change that is not linear."""
 
     @property
     def parameters(self) -> int:
         return self.columns.shape[1] if self.price is None else self.price
+
+    @property
+    def class_name(self) -> str:
+        """Of the class in the comparison of verdicts."""
+        cause = self.family or self.cause
+        return cause if self.joint is None else f"{cause}_{self.joint + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Readings less what is expected of them where nothing has changed, and the changes that may be."""
+
+    residual: Array
+    """(K,) [N·m]."""
+    covariance: Array
+    """Of the residuals (K, K): noise, and what the model does not know."""
+    hypotheses: Sequence[ChangeHypothesis]
+    doubt: float
+    """Relative variance of what χ² is expected to be: scatter and level are estimates."""
+    of_model: Array
+    """Share of the model's own error in the variance of each joint's residuals (n,)."""
+    level: Array
+    """Torque that the model lacks anyway (n,) [N·m]: effects of an arm up to this size are nothing new."""
+    relative_level: Array
+    """The same as a share of the torque (n,): changes' own shapes are as inexact, at most by `INEXACT`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,70 +109,13 @@ class Verdict:
         return next((other for other in self.joints if other != joint), None)
 
 
-class ResidualTest:
-    """Residuals of K rows with what they have in common, and the hypotheses that may explain them."""
-
-    def __init__(self, residual: Array, covariance: Array, hypotheses: Sequence[ChangeHypothesis]) -> None:
-        """residual (K,), covariance (K, K) to expect of it where nothing has changed."""
-        self.hypotheses = tuple(hypotheses)
-        self._root = np.linalg.cholesky(covariance)
-        white = self.whitened(np.column_stack([residual, *(each.columns for each in hypotheses)]))
-        self.residual: Array = white[:, 0]
-        """Whitened."""
-        ends = np.cumsum([1, *(each.columns.shape[1] for each in hypotheses)])
-        self.columns: list[Array] = [white[:, begin:end] for begin, end in pairwise(ends)]
-        """Whitened, of each hypothesis."""
-        self.chi2 = float(self.residual @ self.residual)
-        """Where nothing has changed."""
-
-    def whitened(self, columns: Array) -> Array:
-        return np.linalg.solve(self._root, columns)  # scipy takes longer to load
-
-    def index(self, cause: str, joint: int | None) -> int:
-        """Number of a hypothesis; raises ValueError where there is none."""
-        return [(each.cause, each.joint) for each in self.hypotheses].index((cause, joint))
-
-    def fit(self, *indices: int) -> ChangeFit:
-        columns = np.hstack([self.columns[index] for index in indices])
-        return self.fit_columns([self.hypotheses[index] for index in indices], columns, self.residual)
-
-    @staticmethod
-    def fit_columns(together: Sequence[ChangeHypothesis], columns: Array, target: Array) -> ChangeFit:
-        """Likewise with whitened columns (K, p) and a whitened target (K,) of their own."""
-        u, s, vt, size = _decomposed(columns)
-        kept = s > 0
-        back = (vt[kept].T / s[kept]) / size[:, None]
-        explained = u[:, kept].T @ target
-        covariance, shown = back @ back.T, int(kept.sum())
-        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
-        covariance[hidden] = covariance[:, hidden] = 0.0
-        chi2 = float(target @ target) - float(explained @ explained)
-        price = sum(each.parameters for each in together) - (columns.shape[1] - shown)
-        bic = chi2 + price * float(np.log(len(target)))
-        return ChangeFit(together[0], bic, chi2, back @ explained, covariance, shown)
-
-    def misfit(self, chi2: float, parameters: int, doubt: float) -> float:
-        """χ² above its degrees of freedom, in standard deviations; `doubt`: relative variance of what is expected."""
-        free = max(len(self.residual) - parameters, 1)
-        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + doubt))), 2)
-
-    def noticed(self, index: int, rivals: Iterable[int], needed: float) -> float:
-        """Size of a hypothesis' change that wins in one case of two by a BIC of `needed`: over none, and all rivals."""
-        bases = ((self._bases[rival], self.hypotheses[rival].parameters) for rival in rivals)
-        return smallest_noticed_change(self.columns[index][:, 0], bases, needed)
-
-    @cached_property
-    def _bases(self) -> list[Array]:
-        return [span(columns) for columns in self.columns]
-
-
 def span(columns: Array) -> Array:
     """An orthonormal basis (K, r) of whitened columns (K, p), of which r are independent."""
-    u, s, _, _ = _decomposed(columns)
+    u, s, _, _ = decomposed(columns)
     return u[:, s > 0]
 
 
-def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
+def decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
     """u, s, vt of columns (K, p) in units of their lengths, and these; s is 0 where columns depend on others."""
     size = np.linalg.norm(columns, axis=0)
     size[size <= 1e-9] = 1.0

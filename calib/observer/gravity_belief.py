@@ -1,18 +1,23 @@
 """Belief about the gravity model and what it lacks, adapted to the sensors as they were installed."""
 
+from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading, stack
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD
 from calib.observer.discrepancy import DiscrepancyLevel, Kernel, Posterior, Reference, Rows
+from calib.observer.evidence import ChangeHypothesis, Residuals
 from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
+from gcomp.identify.readings import StaticReadings
 
 WANDER = 0.5
 """How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
@@ -21,6 +26,38 @@ THERMAL, TOLD = 1.0, 0.3
 """Where drives tell their temperature: how far a zero follows a rise of 20 K, as a share of the level, and the share of
 WANDER that is left, since the sensor's own temperature is another."""
 LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
+LEVEL_ROWS = 10
+"""Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
+
+
+def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[ChangeHypothesis]:
+    """Every entry of the dictionary for the true angles of a window; beta (2n,) [kg·m] is the present gravity model."""
+    q, n = window.position, arm.n
+    regressor = gravity_regressor(arm, q)
+    torque = regressor @ beta
+    middle = np.where(np.isfinite(arm.lower + arm.upper), (arm.lower + arm.upper) / 2, 0.0)
+    one = np.ones(len(q))
+
+    def row_of(joint: int, *columns: Array) -> Array:
+        full = np.zeros((len(q), n, len(columns)))
+        full[:, joint] = np.stack(columns, axis=1)
+        return full.reshape(len(q) * n, len(columns))
+
+    for j in range(n):
+        yield ChangeHypothesis("gain", j, row_of(j, torque[:, j]), family="drift")
+        yield ChangeHypothesis("offset", j, row_of(j, one), family="drift")
+        yield ChangeHypothesis("drift", j, row_of(j, torque[:, j], one))
+        yield ChangeHypothesis("friction", j, row_of(j, window.direction[:, j]))
+        yield ChangeHypothesis("spring", j, row_of(j, q[:, j] - middle[j], one))
+    stiffness = gravity_stiffness(arm, beta, q)
+    for j in range(n):
+        yield ChangeHypothesis("slip", j, stiffness[:, :, j].reshape(-1, 1))
+    yield ChangeHypothesis("payload", None, (regressor @ np.column_stack(payload_columns(arm))).reshape(-1, 4))
+    across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
+    tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
+    yield ChangeHypothesis("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
+    # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
+    yield ChangeHypothesis("scale", None, torque.reshape(-1, 1), price=4)
 
 
 @dataclass(frozen=True)
@@ -66,6 +103,11 @@ class GravityBelief:
     error common to the calibration and the gravity model, which no later observation could show.
     """
 
+    of_sensors = True
+    misfit_limit = 4.0
+    """docs/theory.md, section 6."""
+    change_std = np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
+
     def __init__(
         self,
         arm: Arm,
@@ -75,12 +117,14 @@ class GravityBelief:
         level: DiscrepancyLevel | None = None,
         first_rows: int = 120,
         wander: Array | float = np.inf,
+        sigma: Array | None = None,
     ) -> None:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
 
         position_std [rad] is that of a position sensor's zero; without a level the model has no other errors. wander
         (n,) [N·m]: most that zeros move with temperature (standard deviation). first_rows: rows of the
         first epoch, and the most that the level is fitted to, evenly chosen: with 120 it is known to 7 %, in 50 ms.
+        sigma (n,) [N·m]: of one row to begin with.
         """
         self.arm = arm
         self.beta: Array = np.array(beta, dtype=float)
@@ -92,7 +136,9 @@ class GravityBelief:
         self.mass = 0.0
         """Mass of the loads that the model has taken over as tools [kg]."""
         self.level = DiscrepancyLevel.none(arm.n) if level is None else level
+        self.sigma: Array = np.zeros(arm.n) if sigma is None else np.asarray(sigma, dtype=float)
         self._noise: Array = np.zeros(arm.n)
+        """`sigma` when rows were learned last."""
         self._reference = Reference(arm.n, first_rows)
         self._posterior: Posterior | None = None
         self._kernel: Kernel | None = None
@@ -103,6 +149,14 @@ class GravityBelief:
         if self._kernel is None:
             self._kernel = Kernel(self.arm, self.beta)
         return self._kernel
+
+    @property
+    def payload_rank(self) -> int:
+        return self.kernel.payload_rank
+
+    @property
+    def is_known(self) -> bool:
+        return self.level.is_known
 
     @property
     def learnt(self) -> int:
@@ -132,6 +186,26 @@ class GravityBelief:
         tool = (regressor @ self._tool).reshape(q.size, -1)
         return Expected(torque, mean, blocks, np.hstack([flat, tool]))
 
+    def residuals(self, window: StaticReadings, temperature: Array | None = None) -> Residuals:
+        expected = self.expected(window.position, window.direction, temperature)
+        residual = window.torque - expected.torque - expected.mean
+        covariance = expected.covariance.copy()
+        covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
+        noise, level = (window.sigma**2).mean(axis=0), self.level.total
+        return Residuals(
+            residual.ravel(),
+            covariance,
+            list(dictionary(self.arm, self.beta, window)),
+            doubt=len(window.position) / (self.level.rows + LEVEL_ROWS) if level.any() else 0.0,
+            of_model=1 - noise / (noise + expected.variance.mean(axis=0)),
+            level=level,
+            relative_level=level / self.kernel.typical,
+        )
+
+    def anywhere(self, count: int) -> StaticReadings:
+        position = self.kernel.poses[:count]
+        return StaticReadings.of(position, self.torque(position), self.sigma)
+
     def before(self, position: Array) -> "GravityBelief":
         """The belief from the reference rows before the one of this pose (n,): what a window is tested against."""
         rows = self._reference.before(position)
@@ -152,20 +226,23 @@ class GravityBelief:
         self._reference.close()
         self._kernel = self._posterior = None
 
-    def learn(self, q: Array, torque: Array, side: Array, noise: Array, temperature: Array | None = None) -> None:
-        """Take K rows free of drift as reference: q (K, n) [rad], torque (K, n) [N·m], side (K, n), noise (n,) [N·m],
-        temperature (K, n) [°C]."""
-        told = np.full(q.shape, np.nan) if temperature is None else temperature
-        if not self._reference.add(q, torque - self.torque(q), side, told):
+    def learn(self, rows: list[StaticReading]) -> None:
+        if not rows or not self._reference.add(*self._columns_of(rows)):
             return
-        self._noise, self._posterior = noise, None
+        self._noise, self._posterior = self.sigma, None
         self._fit_level(self._reference.rows)
 
-    def adapt(self, q: Array, torque: Array, side: Array, noise: Array) -> None:
+    def adapt(self, rows: list[StaticReading]) -> None:
         """Adapt the level alone, to rows that may have an offset, a gain or a payload that is not known."""
-        self._noise, self._posterior = noise, None
-        untold = np.full(q.shape, np.nan)
-        self._fit_level(self._reference.rows.and_then(q, torque - self.torque(q), side, untold, epoch=-1))
+        self._noise, self._posterior = self.sigma, None
+        position, residual, side, _ = self._columns_of(rows)
+        self._fit_level(self._reference.rows.and_then(position, residual, side, np.full(side.shape, np.nan), epoch=-1))
+
+    def _columns_of(self, rows: list[StaticReading]) -> tuple[Array, Array, Array, Array]:
+        """Positions, residuals, sides of approach and temperatures (K, n) of rows."""
+        q = stack(rows, "position")
+        residual = stack(rows, "torque") - self.torque(q)
+        return q, residual, stack(rows, "direction"), stack(rows, "temperature")
 
     def close(self) -> None:
         """A sensor was corrected: rows from now on tell nothing of gains and offsets."""
@@ -212,6 +289,7 @@ class GravityBelief:
             "factor": self._factor.tolist(),
             "tool": self._tool.tolist(),
             "mass": self.mass,
+            "sigma": self.sigma.tolist(),
             "noise": self._noise.tolist(),
             "level": {**level, "rows": self.level.rows},
         } | self._reference.save()
@@ -220,6 +298,7 @@ class GravityBelief:
         """States of before the discrepancy have no level and no reference rows: those begin again."""
         size, n, saved = self.beta.size, self.arm.n, values.get("level")
         self.beta = as_array("beta", values["beta"], (size,))
+        self.sigma = as_array("sigma", values["sigma"], (n,))
         self._factor = as_array("factor", values["factor"], (size, None))
         self._tool = as_array("tool", np.reshape(values.get("tool", []), (size, -1)), (size, None))
         self._noise, self.mass = as_array("noise", values.get("noise", np.zeros(n)), (n,)), float(values["mass"])

@@ -1,128 +1,32 @@
-"""Rows of motion of drives whose torque is a motor current, and the belief about these: friction, gravity, doubts.
-
-Where torque is a motor current, friction hides gravity at rest; while a joint moves, friction has a known sign. A row
-is a passage: the averages over a stretch of ordinary motion in which a joint moves at constant speed. A stretch counts
-only if no joint of the arm speeds up or slows down in it, so that inertia takes no torque.
+"""Belief about drives whose torque is a motor current, from rows of motion: friction, gravity, doubts.
 
 The unknowns are those of `gcomp.identify.motor_model`, against readings that are corrected by the record in force:
 gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and
 mass moments go together, nor how friction changes over position: that is learned from work in which nothing changed.
 """
 
-from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 
 from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
-from calib.motion.static_reading import LEAST_SAMPLES, slope
-from calib.observer.config import LONGEST_GAP, PLACE_SIZE
-from calib.observer.saved_values import known
+from calib.fit.sweep_readings import FEWEST
+from calib.motion.static_reading import StaticReading, batch, stack
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, PLACE_SIZE
+from calib.observer.evidence import INEXACT, ChangeHypothesis, Residuals
+from calib.observer.saved_values import read_rows, save_rows
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque, Parameter
 from gcomp.arm.arm import Arm
-from gcomp.arrays import Array, as_array
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.motor_model import LAST_ZERO, MotorDoubt, MotorModel, family_slices
 from gcomp.identify.readings import StaticReadings
 
-WIDTH = 0.1
-"""A stretch is complete when some joint has moved this far [rad]: two or three periods of a motor's cogging."""
-LEAST_SECONDS, MOST_SECONDS = 0.2, 3.0
-"""Shortest and longest stretch [s]: a slower joint creeps below the speeds at which its friction is known."""
-SLOWEST = 0.03
-"""Below this speed friction depends on the time at rest [rad/s]: such a joint gives no row."""
-STEADY = 0.15
-"""Largest acceleration in a stretch [rad/s²]: 1 kg·m² then takes 0.15 N·m."""
-TURNED = 0.03
-"""After a reversal friction has turned round once the joint has moved so far [rad]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Passage:
-    """One joint's averages over a stretch of motion."""
-
-    t: float
-    """Middle of the stretch [s]."""
-    joint: int
-    position: Array
-    """Of all joints (n,) [rad]."""
-    torque: float
-    """Of this joint's motor [N·m]."""
-    velocity: float
-    """Of this joint, with sign [rad/s]."""
-    temperature: float
-    """Of its drive [°C]; NaN if it is not known."""
-
-    def to_json(self) -> list[Any]:
-        """As JSON values, without the time, since clocks restart with the machine."""
-        warm = known(np.array([self.temperature]))[0]
-        return [self.joint, self.position.tolist(), self.torque, self.velocity, warm]
-
-    @classmethod
-    def from_json(cls, values: Any, n: int) -> "Passage":
-        """Read back; raises TypeError, ValueError or LookupError where the values do not fit n joints."""
-        joint, position, torque, velocity, warm = values
-        if not 0 <= int(joint) < n:
-            raise ValueError(f"joint {joint} of {n}")
-        temperature = np.nan if warm is None else float(warm)
-        where = as_array("position", position, (n,))
-        return cls(0.0, int(joint), where, float(torque), float(velocity), temperature)
-
-
-@dataclass
-class PassageDetector:
-    """Cuts samples of an arm of n joints into stretches, and averages the steady ones."""
-
-    n: int
-    _samples: list[tuple[float, Array, Array]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._side = np.zeros(self.n)
-        self._turned_at = np.full(self.n, np.nan)
-
-    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Passage]:
-        """Take one sample ((n,) each, SI, temperatures in °C); the rows of the stretch that it completes."""
-        if not (np.isfinite(position).all() and np.isfinite(torque).all()):
-            self._samples.clear()
-            return []
-        if self._samples and not 0 < t - self._samples[-1][0] <= LONGEST_GAP:
-            self._samples.clear()
-        self._samples.append((t, position.copy(), torque.copy()))
-        first = self._samples[0]
-        if np.abs(position - first[1]).max() < WIDTH or t - first[0] < LEAST_SECONDS:
-            if t - first[0] > MOST_SECONDS:
-                self._samples = [self._samples[-1]]
-            return []
-        rows = self._rows(np.full(self.n, np.nan) if temperature is None else temperature)
-        self._samples = [self._samples[-1]]
-        return rows
-
-    def _rows(self, temperature: Array) -> list[Passage]:
-        times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
-        if len(times) < LEAST_SAMPLES:
-            return []
-        half = len(times) // 2
-        early, late = slope(times[: half + 1], positions[: half + 1]), slope(times[half:], positions[half:])
-        velocity = (positions[-1] - positions[0]) / (times[-1] - times[0])
-        side = np.where(np.abs(velocity) >= SLOWEST, np.sign(velocity), 0.0)
-        turned = (side != 0) & (side != self._side)
-        self._turned_at = np.where(turned, positions[0], self._turned_at)
-        self._side = np.where(side != 0, side, self._side)
-        if (np.abs(late - early) > STEADY * (times[-1] - times[0]) / 2).any():
-            return []
-        onward = (np.sign(early) == side) & (np.sign(late) == side)
-        settled = np.abs(positions[0] - self._turned_at) >= TURNED
-        weight = np.hanning(len(times) + 2)[1:-1]  # suppresses ripple with the position
-        weight /= weight.sum()
-        here, pull, when = weight @ positions, weight @ torques, float(weight @ times)
-        return [
-            Passage(when, int(j), here, float(pull[j]), float(velocity[j]), float(temperature[j]))
-            for j in np.flatnonzero((side != 0) & onward & settled)
-        ]
-
-
+REFERENCE = 360
+"""Rows without a change that the belief is learned from: four minutes of creeping."""
 ZERO_STD = 2e-3
 """Least standard deviation of a position zero [rad]: links give way."""
 SIGMA_SHARE = 2e-3
@@ -140,6 +44,16 @@ KNOWN_WARMTH_STD = 5e-4
 
 class MotorBelief:
     """Parameters and covariance of an arm's drives, and the standard deviation of a row."""
+
+    of_sensors = False
+    misfit_limit = 8.0
+    """120 rows then scatter by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is
+    far beyond."""
+    change_std = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
+    """A choice."""
+    mass = 0.0
+    payload_rank = 1
+    is_known = True
 
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array) -> None:
         """Of records of creep sweeps; rated torques (n,) [N·m]."""
@@ -172,59 +86,106 @@ class MotorBelief:
         fitted = np.array([joint.residual_std or np.nan for joint in calibration.joints])
         self.sigma = np.sqrt(ALIKE) * np.where(np.isfinite(fitted), fitted, SIGMA_SHARE * rated)
         """Standard deviation of a row, and of what it has in common with its neighbours (n,) [N·m]."""
-        self.learnt: list[Passage] = []
+        self._reference: list[StaticReading] = []
         """Rows that the belief rests on, beside the records."""
         self._first = (self.mean, self.covariance, self.sigma)
 
-    def rows(self, passages: Sequence[Passage]) -> StaticReadings:
-        joint = np.array([each.joint for each in passages], dtype=np.int64)
-        warm = np.array([each.temperature for each in passages]) - self.reference_temperature[joint]
-        own = np.arange(self.arm.n) == joint[:, None]
+    @property
+    def learnt(self) -> int:
+        return len(self._reference)
 
-        def of_own(values: Array) -> Array:
-            return np.asarray(own * values[:, None])
+    @property
+    def is_first(self) -> bool:
+        return self.learnt < REFERENCE
 
-        return StaticReadings(
-            np.array([each.position for each in passages]).reshape(-1, self.arm.n),
-            np.where(own, np.array([each.torque for each in passages])[:, None], np.nan),
-            self.sigma,
-            velocity=of_own(np.array([each.velocity for each in passages])),
-            warmth=of_own(np.nan_to_num(warm)),
-        )
-
-    def linearised(self, passages: Sequence[Passage], carried: Array | None = None) -> tuple[Array, Array, Array]:
-        """(Residuals (K,) [N·m], derivatives (K, P) of the readings, covariance (K, K) to expect of the residuals).
-
-        `carried` (2n,) [kg·m] is added to the mass moments.
-        """
-        model, mean = MotorModel(self.arm, self.rows(passages)), self.mean
-        if carried is not None:
-            mean = mean.copy()
-            mean[self._at["beta"]] += carried
-        predicted, jacobian = model.linearised(mean)
+    def residuals(self, window: StaticReadings, temperature: Array | None = None) -> Residuals:
+        model = self._model(window, temperature)
+        predicted, jacobian = model.linearised(self.mean)
         covariance = jacobian @ self.covariance @ jacobian.T
         covariance[np.diag_indices(len(jacobian))] += self.sigma[model.joint] ** 2
-        untold = np.array([np.isnan(each.temperature - self.reference_temperature[each.joint]) for each in passages])
+        untold = np.full(len(jacobian), True) if temperature is None else np.isnan(temperature[window.counted])
+        untold |= np.isnan(self.reference_temperature[model.joint])
         by_gain = jacobian[:, self._at["gain"]] * np.where(untold, UNKNOWN_WARMTH_STD, KNOWN_WARMTH_STD)[:, None]
-        return model.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
+        nothing = np.zeros(self.arm.n)
+        return Residuals(
+            model.reading - predicted,
+            covariance + by_gain @ by_gain.T,
+            self._changes(model, jacobian),
+            doubt=len(jacobian) / (self.learnt + USUAL_ROWS),
+            of_model=nothing,
+            level=nothing,
+            relative_level=np.full(self.arm.n, INEXACT),
+        )
 
-    def learn(self, passages: Sequence[Passage]) -> Self:
-        """The belief with more rows in which nothing has changed."""
-        belief = copy(self)
-        belief.learnt = [*self.learnt, *passages]
-        first_mean, first_covariance, belief.sigma = self._first
-        model = MotorModel(self.arm, self.rows(belief.learnt))
-        belief.mean = first_mean
+    def _model(self, window: StaticReadings, temperature: Array | None) -> MotorModel:
+        warm = np.full(window.position.shape, np.nan) if temperature is None else temperature
+        warmth = np.where(window.counted, np.nan_to_num(warm - self.reference_temperature), 0.0)
+        return MotorModel(self.arm, replace(window, warmth=warmth))
+
+    def _changes(self, model: MotorModel, jacobian: Array) -> list[ChangeHypothesis]:
+        at, found = self._at, list[ChangeHypothesis]()
+        coulomb, load = self.mean[at["coulomb"]], self.mean[at["load"]]
+        uneven = np.arange(at["uneven"].start, at["uneven"].stop).reshape(self.arm.n, -1)
+        for j in np.flatnonzero(np.bincount(model.joint, minlength=self.arm.n) >= FEWEST).tolist():
+            column = {name: jacobian[:, at[name].start + j] for name in ("gain", "offset", "coulomb", "load")}
+            friction = coulomb[j] * column["coulomb"] + load[j] * column["load"]
+            friction = friction + jacobian[:, uneven[j]] @ self.mean[uneven[j]]
+            for cause, each in (("gain", column["gain"]), ("offset", column["offset"]), ("friction", friction)):
+                if np.abs(each).max() > 1e-9:
+                    found.append(ChangeHypothesis(cause, j, each[:, None]))
+        per_unit = np.column_stack(payload_columns(self.arm))
+
+        def about(values: Array) -> tuple[Array, Array]:
+            """A payload's: friction goes with torque, whose sign a load may turn."""
+            mean = self.mean.copy()
+            mean[at["beta"]] += per_unit @ values
+            predicted, turned = model.linearised(mean)
+            return model.reading - predicted, turned[:, at["beta"]] @ per_unit
+
+        payload = jacobian[:, at["beta"]] @ per_unit
+        if np.abs(payload).max() > 1e-9:
+            found.append(ChangeHypothesis("payload", None, payload, about=about))
+        return found
+
+    def anywhere(self, count: int) -> None:
+        return None
+
+    def before(self, position: Array) -> Self:
+        same = [k for k, row in enumerate(self._reference) if np.array_equal(row.position, position)]
+        if not same:
+            return self
+        earlier = copy(self)
+        earlier._rest_on(self._reference[: same[0]])
+        return earlier
+
+    def learn(self, rows: list[StaticReading]) -> None:
+        if rows and self.is_first:
+            self._rest_on([*self._reference, *rows])
+
+    def adapt(self, rows: list[StaticReading]) -> None:
+        """While it is learned what the arm's own is; later rows that nothing explains are no scatter."""
+        if self.is_first:
+            model = self._model(batch(rows, self.sigma), stack(rows, "temperature"))
+            self.sigma = np.maximum(self.sigma, self._scatter(model, model.reading - model.predict(self.mean)))
+
+    def close(self) -> None: ...
+
+    def _rest_on(self, rows: list[StaticReading]) -> None:
+        self._reference = rows
+        first_mean, first_covariance, self.sigma = self._first
+        self.mean, self.covariance = first_mean, first_covariance
+        if not rows:
+            return
+        model = self._model(batch(rows, self.sigma), stack(rows, "temperature"))
         for _ in range(NOISE_ROUNDS):
-            predicted, jacobian = model.linearised(belief.mean)
-            noise = belief.sigma[model.joint] ** 2
-            target = model.reading - predicted + jacobian @ (belief.mean - first_mean)
+            predicted, jacobian = model.linearised(self.mean)
+            noise = self.sigma[model.joint] ** 2
+            target = model.reading - predicted + jacobian @ (self.mean - first_mean)
             of_mean = first_covariance @ jacobian.T
             gain = np.linalg.solve(jacobian @ of_mean + np.diag(noise), of_mean.T).T
-            belief.mean = first_mean + gain @ target
-            belief.covariance = first_covariance - gain @ of_mean.T
-            belief.sigma = self._scatter(model, model.reading - model.predict(belief.mean))
-        return belief
+            self.mean = first_mean + gain @ target
+            self.covariance = first_covariance - gain @ of_mean.T
+            self.sigma = self._scatter(model, model.reading - model.predict(self.mean))
 
     def _scatter(self, model: MotorModel, residual: Array) -> Array:
         """Standard deviation of a row (n,) [N·m]: as measured, drawn towards what was assumed.
@@ -241,9 +202,15 @@ class MotorBelief:
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
         return found
 
-    def gravity_torque(self, position: Array) -> Array:
-        """Gravity torque (K, n) [N·m] at angles (K, n)."""
-        return gravity_regressor(self.arm, position) @ self.mean[self._at["beta"]]
+    def torque(self, q: Array) -> Array:
+        return gravity_regressor(self.arm, q) @ self.mean[self._at["beta"]]
+
+    def save(self) -> dict[str, Any]:
+        """The rows that it rests on, as JSON values."""
+        return {"learnt": save_rows(self._reference)}
+
+    def restore(self, values: dict[str, Any]) -> None:
+        self._rest_on(read_rows(values["learnt"], self.arm.n))
 
 
 def _known_std(calibration: CalibrationRecord, parameter: Parameter, before: Array | float) -> Array:

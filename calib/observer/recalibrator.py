@@ -19,7 +19,7 @@ from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
-from calib.observer.rest_detector import RestDetector
+from calib.observer.row_makers import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arrays import Array
@@ -64,9 +64,10 @@ class AfterWrite:
 
     def handle(self, t: float, position: Array, torque: Array) -> Checked | None:
         """Take one sample as the controllers send it ((n,), SI); the outcome once there are enough rests, else None."""
-        row = self._rests.handle(t, position, torque)
-        if row is None:
+        rows = self._rests.handle(t, position, torque)
+        if not rows:
             return None
+        (row,) = rows
         model = gravity_torque(self._arm, self._beta, self._record.angle(row.position)[None])[0, self._joints].tolist()
         sent = row.torque[self._joints].tolist()
         as_before = [old.invert(new.apply(now)) for (old, new), now in zip(self._pairs, sent, strict=True)]

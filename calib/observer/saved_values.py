@@ -32,12 +32,17 @@ def restored(part: Part, values: dict[str, Any]) -> Part:
 
 
 def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
-    """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
-    told = ([known(row.temperature)] if np.isfinite(row.temperature).any() else [] for row in rows)
-    return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *warm]
-        for row, warm in zip(rows, told, strict=True)
-    ]
+    """Rows as JSON values. Of a rest: time, position, torque, side of approach, and temperature if a drive tells it. Of
+    a joint in motion: joint, position, torque, velocity, temperature."""
+    return [_saved(row) for row in rows]
+
+
+def _saved(row: StaticReading) -> list[Any]:
+    if row.joint is None:
+        warm = [known(row.temperature)] if np.isfinite(row.temperature).any() else []
+        return [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *warm]
+    j, velocity = row.joint, float((row.speed or 0.0) * row.direction[row.joint])
+    return [j, row.position.tolist(), float(row.torque[j]), velocity, known(row.temperature)[j]]
 
 
 def read_rows(values: Any, n: int) -> list[StaticReading]:
@@ -45,11 +50,17 @@ def read_rows(values: Any, n: int) -> list[StaticReading]:
     return [_row(n, *row) for row in values]
 
 
-def _row(n: int, t: Any, position: Any, torque: Any, direction: Any, temperature: Any = None) -> StaticReading:
-    position, torque, direction = (as_array("row", column, (n,)) for column in (position, torque, direction))
+def _row(n: int, first: Any, position: Any, torque: Any, motion: Any, temperature: Any = None) -> StaticReading:
+    if isinstance(torque, int | float):
+        if not 0 <= int(first) < n:
+            raise ValueError(f"joint {first} of {n}")
+        warm = np.nan if temperature is None else float(temperature)
+        where = as_array("position", position, (n,))
+        return StaticReading.of_motion(0.0, int(first), where, float(torque), float(motion), warm)
+    position, torque, direction = (as_array("row", column, (n,)) for column in (position, torque, motion))
     untold = np.full(n, np.nan)
     told = as_array("row", untold if temperature is None else temperature, (n,), finite=False)
-    return StaticReading.of(float(t), position, torque, direction, temperature=told)
+    return StaticReading.of(float(first), position, torque, direction, temperature=told)
 
 
 def known(values: Array) -> Any:

@@ -7,7 +7,7 @@ from armlink.errors import Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.open import ArmDriver
 from calib.observer.decision import Event
-from calib.observer.observer import AnyObserver
+from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibration, Recalibrator
 from gcomp.arrays import Array
 
@@ -33,7 +33,7 @@ class WatchHistory:
 
 def watch(
     link: ArmDriver,
-    observer: AnyObserver,
+    observer: Observer,
     targets: Iterable[Array],
     seconds: float,
     recalibrator: Recalibrator | None = None,
@@ -63,7 +63,7 @@ def watch(
     return history
 
 
-def _recalibrate(event: Event, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
     assert event.finding is not None
     try:
         outcome = recalibrator.recalibrate(event.finding)
@@ -76,7 +76,7 @@ def _recalibrate(event: Event, observer: AnyObserver, recalibrator: Recalibrator
     observer.install(event.finding)
 
 
-def _check(sample: Sample, observer: AnyObserver, recalibrator: Recalibrator, history: WatchHistory) -> None:
+def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
     """After a recalibration: take it back if it made the readings worse."""
     checked = recalibrator.sample(sample.t, sample.position, sample.torque)
     if checked is None or checked.verdict == "kept":
@@ -89,7 +89,7 @@ def _check(sample: Sample, observer: AnyObserver, recalibrator: Recalibrator, hi
         observer.install(outcome.undo)
 
 
-def _keep(t: float, observer: AnyObserver, history: WatchHistory) -> None:
+def _keep(t: float, observer: Observer, history: WatchHistory) -> None:
     estimate = observer.estimate()
     history.t.append(t)
     for name in ("gain", "gain_std", "offset", "offset_std"):

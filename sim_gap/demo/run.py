@@ -285,8 +285,8 @@ class Demo:
         with account.stage("ordinary work, during which a torque sensor will drift") as screen:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
         # of any joint: which one drifted is found later
-        times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, after=began)) is not None]
-        noticed = min(times, default=None)
+        alarm = history.first("alarm", after=began)
+        noticed = None if alarm is None else alarm - began
         made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name]
         written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written

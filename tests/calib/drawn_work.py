@@ -9,7 +9,8 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.motor_belief import WIDTH, Passage
+from calib.motion.static_reading import StaticReading
+from calib.observer.row_makers import WIDTH
 from calib.records.records import CalibrationRecord
 
 SPEEDS = (0.1, 0.6)
@@ -37,15 +38,14 @@ NOTHING = Change()
 def work(
     arm: ArmFile, made: DrawnCreep, record: CalibrationRecord, random: np.random.Generator, rows: int,
     change: Change = NOTHING,
-) -> list[Passage]:  # fmt: skip
+) -> list[StaticReading]:  # fmt: skip
     """So many passages of motions of one to three joints at a time between random poses; time goes on from motion to
-    motion. Readings are corrected by the record, positions are true angles by it."""
+    motion. Readings are corrected by the record."""
     simulated = made.simulated
     described = gcomp_arm(arm)
     limits = np.stack([described.lower, described.upper], axis=1)
-    n, found = described.n, list[Passage]()
+    n, found = described.n, list[StaticReading]()
     simulated.attach_mass(change.payload)
-    zero = record.values("position_offset", 0.0)
     held = record.torque_calibration(TorqueCalibration(np.ones(n), np.zeros(n)))
     here = limits.mean(axis=1)
     while len(found) < rows:
@@ -62,8 +62,7 @@ def work(
                 torque = _reading(made, q, int(joint), float(velocity[joint]), t, random, change)
                 corrected = (torque - held.offset[joint]) / held.gain[joint]
                 heat = float(np.floor(simulated.sensors.heating(t)[joint]))
-                position = q + zero
-                found.append(Passage(t, int(joint), position, corrected, float(velocity[joint]), heat))
+                found.append(StaticReading.of_motion(t, int(joint), q, corrected, float(velocity[joint]), heat))
         simulated.time += seconds + PAUSE
         here = goal
     simulated.attach_mass(0.0)

@@ -60,7 +60,7 @@ class FastArm:
 
     def observer(self, config: ObserverConfig | None = None) -> Observer:
         config = config or ObserverConfig()
-        return Observer(self.arm, self.model, self.covariance, config.noise_share * self.rated, config)
+        return Observer.at_rest(self.arm, self.model, self.covariance, config.noise_share * self.rated, config)
 
     def carry(self, mass: float, point: np.ndarray) -> None:
         at_origin, by_point = payload_columns(self.arm)

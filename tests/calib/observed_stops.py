@@ -25,7 +25,7 @@ class Bench:
         scale = 1 + 3e-3 * self.random.normal()  # common to calibration and model: nobody can see it
         covariance = np.diag(MODEL_STD**2) + 9e-6 * np.outer(beta, beta)
         model = (beta + MODEL_STD * self.random.normal(size=beta.size)) * scale
-        self.observer = Observer(arm, model, covariance, SIGMA, config)
+        self.observer = Observer.at_rest(arm, model, covariance, SIGMA, config)
         self.scale = scale
         self.gain, self.offset = np.ones(arm.n), np.zeros(arm.n)
         """Of the readings as installed."""

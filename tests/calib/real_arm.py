@@ -91,4 +91,4 @@ class RealArm(RestArm):
         config = config or ObserverConfig()
         level = DiscrepancyLevel.expected(self.level, np.full(self.n, 0.5)) if told else None
         sigma = config.noise_share * self.rated
-        return Observer(self.arm, self.model, self.covariance, sigma, config, level=level)
+        return Observer.at_rest(self.arm, self.model, self.covariance, sigma, config, level=level)

@@ -74,7 +74,7 @@ def replay(name: str) -> list[str]:
     """What the observer makes of a recording: a line an event and, every half minute, a line a joint."""
     recording = load_recording(FOLDER / f"{name}.csv.gz")
     arm = FastArm("sarcos", seed=sorted(RUNS).index(name))
-    observer = Observer(arm.arm, arm.model, arm.covariance, 1e-3 * arm.rated)
+    observer = Observer.at_rest(arm.arm, arm.model, arm.covariance, 1e-3 * arm.rated)
     assert load_arm("sarcos").joint_names == recording.names
     assert recording.torque is not None
     lines, told = [f"# {name}: {RUNS[name][0].__doc__}"], 30.0

@@ -21,7 +21,8 @@ from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.creep_fit import fit_rows
-from calib.observer.moving_observer import MovingObserver
+from calib.observer.cause_test import cause_test
+from calib.observer.observer import IN_MOTION, Observer
 from calib.plan.creep_plan import plan_creep
 
 GAIN, FRICTION, PAYLOAD = 0.05, 1.3, 0.3
@@ -42,9 +43,11 @@ def run(seed: int, rows: int) -> dict[str, tuple[bool, bool, str]]:
     gravity = fit.gravity.record(arm, calibration)
     told: dict[str, tuple[bool, bool, str]] = {}
     for kind in KINDS:
-        observer, events = MovingObserver(kinematics, calibration, gravity, rated), []
-        for row in work(arm, made, calibration, random, UNCHANGED):
+        observer, events = Observer.in_motion(kinematics, calibration, gravity, rated), []
+        before = work(arm, made, calibration, random, UNCHANGED)
+        for row in before:
             events += observer.handle_row(row)
+        test = cause_test(observer._belief, before[-IN_MOTION.longest :])
         joint = int(random.integers(kinematics.n))
         sign = random.choice([-1, 1])
         change = {
@@ -56,8 +59,7 @@ def run(seed: int, rows: int) -> dict[str, tuple[bool, bool, str]]:
         for row in work(arm, made, calibration, random, rows, change):
             events += observer.handle_row(row)
         size = {"gain": GAIN, "friction": FRICTION - 1}.get(kind)
-        test = observer._test()
-        expected = size is None or (test is not None and size > 2 * test.noticed(kind, joint))
+        expected = size is None or size > 2 * test.noticed(kind, joint)
         name = kinematics.names[joint] if kind in ("gain", "friction") else None
         said = [(event.joint, event.evidence["cause"]) for event in events]
         right = said == [] if kind == "none" else said == [(name, kind)]

@@ -93,8 +93,6 @@ def describe(event: Event) -> Description:
     joint, evidence = event.joint or "the arm", event.evidence
     if event.kind == "alarm":
         kind, text = "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})"
-    elif event.kind == "outliers":
-        kind, text = "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model"
     elif event.kind == "undecided":
         why = "; ".join(evidence.get("reasons", []))
         kind, text = "undecided", f"{joint}: the calibration was not changed: {why}"

@@ -10,9 +10,9 @@ from drawn_arms import drawn_arm
 from effects_on_readings import SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.cause_test import CauseTest, dictionary
+from calib.observer.cause_test import CauseTest
 from calib.observer.evidence import Verdict, smallest_noticed_change, span
-from calib.observer.gravity_belief import GravityBelief
+from calib.observer.gravity_belief import GravityBelief, dictionary
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness, gravity_torque

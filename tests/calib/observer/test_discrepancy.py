@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rest_arm import RestArm, harmonics
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import LONGEST_WINDOW
 from calib.observer.discrepancy import DiscrepancyLevel, Kernel
@@ -27,6 +28,11 @@ def field(
     return np.asarray(smooth + level.rough * random.normal(size=q.shape))
 
 
+def readings(q: np.ndarray, torque: np.ndarray, side: np.ndarray, warm: float = np.nan) -> list[StaticReading]:
+    temperature = np.full(q.shape[1], warm)
+    return [StaticReading.of(0.0, *row, temperature=temperature) for row in zip(q, torque, side, strict=True)]
+
+
 def rows(arm, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return random.uniform(arm.lower, arm.upper, (count, arm.n)), random.choice([-1.0, 1.0], (count, arm.n))
 
@@ -36,12 +42,11 @@ def test_the_level_is_found_whatever_was_expected(sarcos, sarcos_beta) -> None:
     for share in (0.1, 1.0, 10.0):
         random = np.random.default_rng(int(10 * share))
         truth = DiscrepancyLevel.expected(np.full(7, 0.2 * share))
-        belief = GravityBelief(
-            sarcos, sarcos_beta, np.zeros((14, 14)), level=DiscrepancyLevel.expected(np.full(7, 0.2))
-        )
+        level = DiscrepancyLevel.expected(np.full(7, 0.2))
+        belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level, sigma=np.full(7, NOISE))
         q, side = rows(sarcos, 120, random)
         torque = belief.torque(q) + field(belief.kernel, truth, q, side, random) + NOISE * random.normal(size=q.shape)
-        belief.learn(q, torque, side, np.full(7, NOISE))
+        belief.learn(readings(q, torque, side))
         if share > 0.1:  # below the noise it is only bounded
             np.testing.assert_allclose(belief.level.total, truth.total, rtol=0.4)
         assert (belief.level.total < 1.6 * truth.total + NOISE).all()
@@ -50,10 +55,10 @@ def test_the_level_is_found_whatever_was_expected(sarcos, sarcos_beta) -> None:
 def test_an_offset_a_gain_and_a_payload_are_not_taken_for_discrepancy(sarcos, sarcos_beta) -> None:
     random = np.random.default_rng(3)
     expected = DiscrepancyLevel.expected(np.full(7, 0.05))
-    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=expected)
+    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=expected, sigma=np.full(7, NOISE))
     q, side = rows(sarcos, 60, random)
     torque = 1.05 * belief.torque(q) + 0.5 + NOISE * random.normal(size=q.shape)
-    belief.adapt(q, torque, side, np.full(7, NOISE))
+    belief.adapt(readings(q, torque, side))
     assert (belief.level.total < expected.before).all()
 
 
@@ -77,12 +82,12 @@ def test_what_is_predicted_holds_within_its_covariance(sarcos, sarcos_beta) -> N
     truth = DiscrepancyLevel.expected(np.full(7, 0.2))
     std = 2e-3 * np.ones(14)
     for _ in range(6):
-        belief = GravityBelief(sarcos, sarcos_beta, np.diag(std**2), level=truth)
+        belief = GravityBelief(sarcos, sarcos_beta, np.diag(std**2), level=truth, sigma=np.full(7, NOISE))
         belief._fit_level = lambda rows: None  # type: ignore[method-assign]
         q, side = rows(sarcos, 130, random)
         exact = GravityBelief(sarcos, sarcos_beta + std * random.normal(size=14), np.zeros((14, 14)))
         torque = exact.torque(q) + field(belief.kernel, truth, q, side, random) + NOISE * random.normal(size=q.shape)
-        belief.learn(q[:100], torque[:100], side[:100], np.full(7, NOISE))
+        belief.learn(readings(q[:100], torque[:100], side[:100]))
         expected = belief.expected(q[100:], side[100:])
         error = (torque - belief.torque(q))[100:] - expected.mean
         covariance = expected.covariance + NOISE**2 * np.eye(210)
@@ -96,13 +101,13 @@ def test_a_drift_of_later_rows_is_not_learned(sarcos, sarcos_beta) -> None:
     """A gain of 2 % more in every later epoch stays in what is left."""
     random = np.random.default_rng(5)
     level = DiscrepancyLevel.expected(np.full(7, 0.2))
-    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level)
+    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level, sigma=np.full(7, NOISE))
     q, side = rows(sarcos, 400, random)
     torque = belief.torque(q) + field(belief.kernel, level, q, side, random) + NOISE * random.normal(size=q.shape)
     torque[120:, 1] *= 1.02
     for start in range(0, 360, 40):
         part = slice(start, start + 40)
-        belief.learn(q[part], torque[part], side[part], np.full(7, NOISE))
+        belief.learn(readings(q[part], torque[part], side[part]))
     window = StaticReadings(q[360:], torque[360:], np.full(7, NOISE), direction=side[360:])
     change, covariance = CauseTest(belief, window).drift(1, "gain")
     assert abs(change[0] - 0.02) < 4 * np.sqrt(covariance[0, 0]) < 0.016
@@ -112,11 +117,11 @@ def warmed(sarcos, sarcos_beta, warmer: float, *, told: bool) -> CauseTest:
     """40 rows, warmer than the reference; a zero has moved by 0.35 N·m, where 0.2 are expected of 20 K."""
     random = np.random.default_rng(6)
     level = DiscrepancyLevel.expected(np.full(7, 0.2))
-    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level)
+    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level, sigma=np.full(7, NOISE))
     q, side = rows(sarcos, 160, random)
     torque = belief.torque(q) + field(belief.kernel, level, q, side, random) + NOISE * random.normal(size=q.shape)
     temperature = np.full(q.shape, 30.0 if told else np.nan)
-    belief.learn(q[:120], torque[:120], side[:120], np.full(7, NOISE), temperature[:120])
+    belief.learn(readings(q[:120], torque[:120], side[:120], temperature[0, 0]))
     torque[120:, 2] += 0.35
     window = StaticReadings(q[120:], torque[120:], np.full(7, NOISE), direction=side[120:])
     return CauseTest(belief, window, temperature[120:] + warmer)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
+from calib.observer.alarms import Cusum
 from calib.observer.cause_test import CauseTest
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.tracking import Cusum
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 from gcomp.identify.readings import StaticReadings

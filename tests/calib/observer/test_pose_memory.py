@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from calib.observer.alarms import PLACE_MEMORY, PoseMemory
 from calib.observer.config import LONGEST_WINDOW, PLACE_SIZE
 from calib.observer.saved_values import UNREADABLE, restored
-from calib.observer.tracking import PLACE_MEMORY, PoseMemory
 
 HERE = np.array([0.3, -1.0])
 MODEL, NOISE = np.array([0.04, 0.09]), np.array([0.01, 0.04])

@@ -10,8 +10,8 @@ from observed_stops import Bench, kinds
 def test_what_all_windows_together_do_not_say_is_not_proposed(sarcos, sarcos_beta, monkeypatch, other):
     bench = Bench(sarcos, sarcos_beta, 1)
     bench.work(20)
-    tracking, asked = bench.observer._tracking, []
-    tested = tracking.cause_test
+    asked = []
+    tested = bench.observer._cause_test
 
     def cause_test(rows):
         test = tested(rows)
@@ -21,7 +21,7 @@ def test_what_all_windows_together_do_not_say_is_not_proposed(sarcos, sarcos_bet
             monkeypatch.setattr(test, "verdict", lambda: verdict)
         return test
 
-    monkeypatch.setattr(tracking, "cause_test", cause_test)
+    monkeypatch.setattr(bench.observer, "_cause_test", cause_test)
     bench.drift(2, gain=1.03, offset=0.3)
     events = bench.work(50)
     assert asked

@@ -48,7 +48,7 @@ def _pressed_again(outcome: Outcome, slips: int) -> None:
 
 
 def _said_not_to_be_felt(outcome: Outcome, _: int) -> None:
-    assert "gravity does not load" in outcome.fit.reasons["j1", "gain"]
+    assert "gravity does not act" in outcome.fit.reasons["j1", "gain"]
     assert np.isfinite(outcome.fit.value("offset")[0])
 
 

@@ -39,7 +39,7 @@ export function put(element, text) {
 
 const CATEGORIES = {
   fault: ["fault", "refused", "failed"],
-  drift: ["drift", "alarm", "outliers", "undecided", "proposal", "wear"],
+  drift: ["drift", "alarm", "undecided", "proposal", "wear"],
   load: ["payload", "contact", "effect"],
   change: ["recalibration", "approved", "rejected", "roll-back", "check", "sweep", "recovered"],
 };
