@@ -82,7 +82,7 @@ class Rivals:
         """Effects with which searches that began elsewhere ended, as good, in place of one of these terms of one."""
         choice, own = self.choice, {term.key for term in present}
         there, effects = {term.key for term in choice.current}, {term.effect for term in present}
-        ends = [terms for score, terms in choice.others if choice.loss(score) < AS_GOOD]
+        ends = [terms for worse, terms in choice.others if worse < AS_GOOD * choice.equations.measurements]
         lacking = [term for terms in ends if own - {term.key for term in terms} for term in terms]
         return [term.effect for term in lacking if term.key not in there and term.effect not in effects]
 

@@ -65,10 +65,10 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
         again = search_again(store, start, offered, frozenset({CONSTANT}))
         together = PRICE * effects()[CONSTANT].plausibility.prior_penalty  # of one effect that few arms have
         found.append((again.score + together, again))
-    choice = min(found, key=itemgetter(0))[1]
+    least, choice = min(found, key=itemgetter(0))
     for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
-    choice.others = [(score, other.current) for score, other in found if other is not choice]
+    choice.others = [(score - least, other.current) for score, other in found if other is not choice]
     return choice
 
 

@@ -138,7 +138,7 @@ class TermChoice(EffectChoice[Term]):
         every = [term for term in equations.terms if term.form.plausibility.every_joint and term not in current]
         super().__init__(equations.linear, equations.effects(usual), [*current, *every], least)
         self.others: list[tuple[float, list[Term]]] = []
-        """Scores and terms at which searches ended that began elsewhere."""
+        """Terms at which searches ended that began elsewhere, and how much worse they score."""
 
     def judge(self, names: Sequence[Term]) -> float:
         """As of any choice; infinite for a body that is farther from the tip than its own mass allows."""
