@@ -11,7 +11,7 @@ from functools import cached_property, partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt, sosfreqz
+from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
@@ -388,16 +388,8 @@ def low_pass(cut: float, rate: float, pad: int = 15) -> Callable[[Array], Array]
 
     `pad` is the length of the reflection at either end, in samples.
     """
-    sections = butter(4, cut, fs=rate, output="sos")
-    return partial(_both_ways, sections, sosfilt_zi(sections), pad)
+    return partial(_both_ways, butter(4, cut, fs=rate, output="sos"), pad)
 
 
-def _both_ways(sections: Array, rest: Array, pad: int, x: Array) -> Array:
-    """As `sosfiltfilt` along the first axis; it would solve for the filter at rest, `rest`, in every call."""
-    pad, x = min(pad, len(x) - 1), np.moveaxis(x, 0, -1)
-    first, last = x[..., :1], x[..., -1:]
-    y = np.concatenate([2.0 * first - x[..., pad:0:-1], x, 2.0 * last - x[..., -2 : -pad - 2 : -1]], axis=-1)
-    start = rest.reshape(len(rest), *[1] * (y.ndim - 1), 2)
-    for _ in range(2):
-        y = sosfilt(sections, y, zi=start * y[..., :1])[0][..., ::-1]
-    return np.asarray(np.moveaxis(y[..., pad : y.shape[-1] - pad], -1, 0))
+def _both_ways(sections: Array, pad: int, x: Array) -> Array:
+    return np.asarray(sosfiltfilt(sections, x, axis=0, padlen=min(pad, len(x) - 1)))
