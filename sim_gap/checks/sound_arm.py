@@ -119,7 +119,7 @@ pose shows, which an idle motor or a dead sensor has not: the model's torque and
 BOUND_WEIGHT = 1e12
 """Weight of a coefficient that is held at a bound."""
 ROWS_AT_ONCE = 60_000
-"""Rows of all motions that are fitted in one array."""
+"""Rows of joints that are fitted in one array."""
 
 
 def measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
@@ -156,16 +156,28 @@ def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion], 
     reading = np.array([motion.reading for motion in motions])
     own = np.any((reading != reading[0]) & ~(np.isnan(reading) & np.isnan(reading[0])), axis=1)
     own[[0, *moved]] = True
-    costs, pairs = np.empty(own.shape), np.argwhere(own)
+    scale = _model_size(models)
+    most = np.maximum(arm.stretched_torque, scale.max(-1, keepdims=True))
+    costs, pairs = np.zeros(own.shape), np.argwhere(own)
     for part in np.array_split(pairs, -(-len(pairs) * models.shape[1] // ROWS_AT_ONCE)):
-        costs[tuple(part.T)] = _stacked_costs(arm, models, motions, *part.T)
+        which, joint = part.T
+        model = models[which, :, joint][:, :, None]
+        costs[which, joint] = _stacked_costs(model, scale[which, joint][:, None], most[which], motions, which, joint)
+    beyond = {k: CERTAIN_COST * beyond_range(arm, motions[k].q) for k in {0, *moved}}
+    costs += np.array([beyond.get(k, beyond[0]) for k in range(len(motions))])
     return np.asarray(np.where(own, costs, costs[0]).sum(1))
 
 
 def _stacked_costs(
-    arm: RigidArm, models: Array, motions: Sequence[ChannelMotion], which: NDArray[np.intp], joint: NDArray[np.intp]
+    model: Array,
+    scale: Array,
+    most: Array,
+    motions: Sequence[ChannelMotion],
+    which: NDArray[np.intp],
+    joint: NDArray[np.intp],
 ) -> Array:
-    """The same of some joints of some motions, (P,): arrays of one joint each, (P, K, 1)."""
+    """The same of some joints of some motions within their ranges, (P,): arrays of one joint each, (P, K, 1); `scale`
+    and `most` (P, 1) as in `_own_columns`."""
     size, count, floor, idle = (
         np.array([getattr(motions[m], name)[j] for m, j in zip(which, joint, strict=True)])[:, None]
         for name in ("size", "count", "least", "idle")
@@ -175,9 +187,6 @@ def _stacked_costs(
         for name in ("q", "v", "a", "reading")
     )
     rubs, of_sensor = np.array([(motions[m].rubs, motions[m].channel == "tau") for m in which]).T
-    scale = _model_size(models)
-    most = np.maximum(arm.stretched_torque, scale.max(-1, keepdims=True))
-    model, scale, most = models[which, :, joint][:, :, None], scale[which, joint][:, None], most[which]
     telling = _telling(v, read, of_sensor[:, None, None])
     reading = np.where(np.isfinite(read), read, model)
     columns, spread = _own_columns(scale, most, rubs, model, reading, q, v, a)
@@ -192,7 +201,6 @@ def _stacked_costs(
     without[..., CARRIED, :], without[..., :, CARRIED] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + IDLE_COST
     whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
-    whole += CERTAIN_COST * beyond_range(arm, np.array([motion.q for motion in motions]))[which, joint][:, None]
     return np.asarray((whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))[:, 0])
 
 
