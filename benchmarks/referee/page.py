@@ -22,11 +22,14 @@ def markdown(rounds: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _contradictions(rounds: Sequence[Mapping[str, Any]]) -> str:
-    """Pairs that one round decides one way, and another round the other way."""
-    decided = {(d["score"], d["better"], d["worse"]) for made in rounds for d in made["summary"]["decided"]}
-    both = sorted((key, a, b) for key, a, b in decided if a < b and (key, b, a) in decided)
-    text = "; ".join(f"{key}: {a} and {b}" for key, a, b in both)
-    return f"Differences that two rounds decide in opposite directions: {text or 'none'}."
+    """Pairs that one round decides, and another round has in the other order."""
+    every = [d for made in rounds for d in made["summary"]["differences"]]
+    decided = {(d["score"], d["better"], d["worse"]) for d in every if d["decided"]}
+    order = {(d["score"], d["better"], d["worse"]) for d in every}
+    turned = sorted((key, a, b) for key, a, b in decided if (key, b, a) in order)
+    titles = {score.key: score.title for score in SCORES}
+    text = "; ".join(f"{titles[key]}: {a} is better than {b}" for key, a, b in turned)
+    return f"Differences that one round decides and another round has in the other order: {text or 'none'}."
 
 
 def _round(made: Mapping[str, Any]) -> str:
@@ -84,8 +87,8 @@ def _decided(found: Mapping[str, Any]) -> list[str]:
     lines = []
     for score in SCORES:
         pairs: dict[str, list[str]] = {}
-        for each in found["decided"]:
-            if each["score"] == score.key:
+        for each in found["differences"]:
+            if each["decided"] and each["score"] == score.key:
                 pairs.setdefault(each["better"], []).append(each["worse"])
         text = "; ".join(f"{better} is better than {', '.join(worse)}" for better, worse in pairs.items())
         lines.append(f"- {score.title}: {text or 'none'}")

@@ -4,11 +4,12 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from referee.interface import Answer, Cause, Parameter
 
@@ -18,6 +19,8 @@ FAILED_RATIO = 1.0
 """Of a tool that gave no model: its user is left with the nominal one."""
 LEAST_DISCORDANT = 6
 """Least number of cases that differ: of fewer, a two-sided sign test says nothing at 5 % (2 · 0.5⁶ = 0.03)."""
+WRONG_DECISIONS = 0.05
+"""Probability that any of the differences that a score decides is due to the draw of the cases."""
 DRAWS, WILSON_Z = 2000, 1.959964
 TINY = 1e-4
 """Relative errors and widths below this count as this."""
@@ -152,23 +155,27 @@ def complete(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def summary(rows: Sequence[dict[str, Any]], seed: int = 0) -> dict[str, Any]:
-    """Every score of every tool with its interval, and the pairs of tools of which a score decides."""
+    """Every score of every tool with its interval, and each pair of tools, the better one first: whether the score
+    decides between them. The pairs of a score share `WRONG_DECISIONS` (Bonferroni)."""
     tools = list(dict.fromkeys(row["tool"] for row in rows))
     table: dict[str, dict[str, Any]] = {}
-    decided: list[dict[str, Any]] = []
+    differences: list[dict[str, Any]] = []
     for score in SCORES:
         values = {tool: _by_case(rows, tool, score.key) for tool in tools}
         table[score.key] = {
             tool: estimate([*cases.values()], score, seed) if cases else None for tool, cases in values.items()
         }
-        for better, worse in permutations(tools, 2):
-            common = values[better].keys() & values[worse].keys()
-            pairs = [(values[better][case], values[worse][case]) for case in sorted(common)]
-            if is_decided(pairs, score, seed):
-                decided.append({"score": score.key, "better": better, "worse": worse, "cases": len(pairs)})
+        common = {pair: values[pair[0]].keys() & values[pair[1]].keys() for pair in combinations(tools, 2)}
+        pairs = {pair: sorted(cases) for pair, cases in common.items() if cases}
+        for (first, second), cases in pairs.items():
+            better = advantage([(values[first][case], values[second][case]) for case in cases], score)
+            if better.mean() < 0.0:
+                first, second, better = second, first, -better
+            made = {"score": score.key, "better": first, "worse": second, "cases": len(cases)}
+            differences.append({**made, "decided": is_decided(better, WRONG_DECISIONS / len(pairs))})
     offered = {tool: {part for row in rows if row["tool"] == tool for part in row["offers"]} for tool in tools}
     missing = {s.key: [t for t in tools if not s.needs <= offered[t]] for s in SCORES}
-    return {"tools": tools, "scores": table, "decided": decided, "not_offered": missing}
+    return {"tools": tools, "scores": table, "differences": differences, "not_offered": missing}
 
 
 def _by_case(rows: Sequence[dict[str, Any]], tool: str, key: str) -> dict[str, float]:
@@ -195,16 +202,21 @@ def wilson(count: float, total: int) -> tuple[float, float]:
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
-def is_decided(pairs: Sequence[tuple[float, float]], score: Score, seed: int = 0) -> bool:
-    """Whether the first of each pair is better: the 95 % interval of the mean difference over cases excludes zero, and
-    enough cases differ."""
+def advantage(pairs: Sequence[tuple[float, float]], score: Score) -> Any:
+    """By how much the first of each pair is better: of shares their difference, of other values that of logarithms."""
     both = np.reshape(np.asarray(pairs, float), (-1, 2))
     if not score.share:
         both = np.log(np.maximum(both, TINY))
-    better = (both[:, 1] - both[:, 0]) if score.less_is_better else (both[:, 0] - both[:, 1])
+    return (both[:, 1] - both[:, 0]) if score.less_is_better else (both[:, 0] - both[:, 1])
+
+
+def is_decided(better: Any, level: float) -> bool:
+    """Whether a mean advantage over cases is above zero in a t-test at half this level (two-sided: at this level), and
+    enough cases differ."""
     if np.count_nonzero(better) < LEAST_DISCORDANT:
         return False
-    return bool(np.quantile(_resampled(better, seed), 0.025) > 0.0)
+    error = float(np.std(better, ddof=1)) / math.sqrt(len(better))
+    return bool(better.mean() > stats.t.ppf(1.0 - 0.5 * level, len(better) - 1) * error)
 
 
 def _resampled(x: Any, seed: int) -> Any:

@@ -5,6 +5,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -112,12 +113,28 @@ def test_intervals_over_cases():
 
 
 def test_a_difference_is_decided_over_enough_cases():
-    assert score.is_decided([(1.0, 2.0)] * 6, ERROR)
-    assert not score.is_decided([(1.0, 2.0)] * 5, ERROR)
-    assert not score.is_decided([(2.0, 1.0)] * 6, ERROR)
-    assert not score.is_decided([(1.0, 2.0), (2.0, 1.0)] * 6, SECONDS)
-    assert score.is_decided([(1.0, 0.0)] * 6, FIRST_RIGHT)
-    assert not score.is_decided([(1.0, 1.0)] * 20, FIRST_RIGHT)
+    decided = lambda pairs, key: score.is_decided(score.advantage(pairs, key), 0.05)  # noqa: E731
+    assert decided([(1.0, 2.0)] * 6, ERROR)
+    assert not decided([(1.0, 2.0)] * 5, ERROR)
+    assert not decided([(2.0, 1.0)] * 6, ERROR)
+    assert not decided([(1.0, 2.0), (2.0, 1.0)] * 6, SECONDS)
+    assert decided([(1.0, 0.0)] * 6, FIRST_RIGHT)
+    assert not decided([(1.0, 1.0)] * 20, FIRST_RIGHT)
+    random = np.random.default_rng(3)
+    alike = [score.is_decided(random.normal(size=20), 0.05) for _ in range(4000)]
+    assert np.mean(alike) == pytest.approx(0.025, abs=0.008), "of each direction"
+
+
+def test_tools_that_are_alike_are_seldom_told_apart():
+    """Seven tools whose errors are drawn alike: no score decides anything in 19 of 20 rounds."""
+    random, decided = np.random.default_rng(5), 0
+    for _ in range(200):
+        errors = random.lognormal(size=(7, 30))
+        rows = [
+            row(f"t{k}", str(case), error=value) for k, each in enumerate(errors) for case, value in enumerate(each)
+        ]
+        decided += any(each["decided"] for each in score.summary(rows)["differences"])
+    assert decided <= 20, "binomial: 10 of 200, at most 20 with a probability of 0.999"
 
 
 def row(tool, case, state="answered", nameable=True, **scores):
@@ -150,7 +167,8 @@ def test_the_table_says_who_is_better_and_what_is_not_offered():
     rows = [row("peer", str(k), residual=0.5, rollout=0.4) for k in range(8)]
     rows += [row("armlink", str(k), residual=0.6, rollout=0.41, first_right=1.0) for k in range(8)]
     found = score.summary(rows)
-    assert {"score": "residual", "better": "peer", "worse": "armlink", "cases": 8} in found["decided"]
+    pair = {"better": "peer", "worse": "armlink", "cases": 8, "decided": True}
+    assert {"score": "residual", **pair} in found["differences"]
     assert found["scores"]["first_right"]["peer"] is None
     assert score.no_worse(rows, "armlink", "residual", 0.05) == (0, 8)
     assert score.no_worse(rows, "armlink", "rollout", 0.05) == (8, 8)
@@ -161,10 +179,12 @@ def test_the_table_says_who_is_better_and_what_is_not_offered():
     assert "| error of a parameter / its true change | not offered | not offered |" in text
     assert "held-out residual / that of the nominal model: peer is better than armlink" in text
     assert "not offered" in page.svg(made)
-    turned = [{**each, "better": each["worse"], "worse": each["better"]} for each in found["decided"]]
-    other = {**made, "seeds": [2], "summary": {**found, "decided": turned}}
-    assert "in opposite directions: none." in page.markdown([made, made])
-    assert "in opposite directions: residual: armlink and peer" in page.markdown([made, other])
+    turned = [
+        {**each, "better": each["worse"], "worse": each["better"], "decided": False} for each in found["differences"]
+    ]
+    other = {**made, "seeds": [2], "summary": {**found, "differences": turned}}
+    assert "in the other order: none." in page.markdown([made, made])
+    assert "in the other order: held-out residual / that of the nominal model: peer" in page.markdown([made, other])
 
 
 def test_nobody_reads_or_changes_what_is_sealed(tmp_path):
