@@ -13,31 +13,38 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
+
+from referee import score
+from referee.interface import Answer, answer_from_json, check, load_case
+from referee.measure import actuated
+
 HERE = Path(__file__).parent
 WALL_FACTOR = 20.0
 """Wall-clock time over processor time after which a process is ended: the machine may be busy."""
 GRACE_S = 10.0
 """Processor time beyond the limit for writing an answer [s]."""
 PROGRAM = """
-import importlib.util, json, sys
+import importlib.util, json, sys, traceback
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from referee.interface import NotOffered, load_case
+from referee.interface import Answer, NotOffered, load_case
 try:
     spec = importlib.util.spec_from_file_location("adapter", sys.argv[2])
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    answer = module.solve(load_case(Path(".")))
+    if not isinstance(answer, Answer):
+        raise TypeError(f"solve returned {type(answer).__name__} instead of an Answer")
+    made = {"state": "answered", "answer": answer.to_json()}
+except NotOffered as error:
+    made = {"state": "not offered", "why": str(error)}
 except ImportError as error:
     made = {"state": "not installed", "why": str(error)}
-else:
-    try:
-        made = {"state": "answered", "answer": module.solve(load_case(Path("."))).to_json()}
-    except NotOffered as error:
-        made = {"state": "not offered", "why": str(error)}
-    except ImportError as error:
-        made = {"state": "not installed", "why": str(error)}
-    except Exception as error:
-        made = {"state": "failed", "why": f"{type(error).__name__}: {error}"[:300]}
+except Exception as error:
+    lines = [row.lineno for row in traceback.extract_tb(error.__traceback__) if row.filename == sys.argv[2]]
+    place = f", line {lines[-1]}" if lines else ""
+    made = {"state": "failed", "why": f"{type(error).__name__}: {error}{place}"[:300]}
 Path("answer.json").write_text(json.dumps(made, default=float))
 """
 
@@ -63,7 +70,7 @@ def tools(more: list[Path], only: list[str]) -> list[Tool]:
 
 def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
     """State, answer and processor seconds of one tool on one case. `state` is answered, not offered, not installed,
-    failed or out of time."""
+    failed or out of time; an answer that cannot be judged is a failure, and `why` says what is wrong."""
     with tempfile.TemporaryDirectory(prefix="referee-") as scratch:
         folder = Path(scratch) / "case"
         shutil.copytree(public, folder)
@@ -85,7 +92,24 @@ def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
             made = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
         elif ended_by in (signal.SIGXCPU, signal.SIGKILL):
             made = {"state": "out of time", "why": f"more than {cpu_seconds:.0f} s"}
-        return {**made, "cpu_seconds": used}
+    if made["state"] == "answered":
+        try:
+            judgeable(answer_from_json(made["answer"]), public)
+        except ValueError as error:
+            made = {"state": "failed", "why": str(error)}
+    return {**made, "cpu_seconds": used}
+
+
+def judgeable(answer: Answer, public: Path) -> None:
+    """Raise ValueError if an answer cannot be judged: its words, numbers and joints, and a model that MuJoCo takes."""
+    case = load_case(public)
+    check(answer, case, score.TABLES["vocabularies"], score.FAMILY)
+    if answer.model is not None:
+        try:
+            model = mujoco.MjModel.from_xml_string(answer.model)
+        except ValueError as error:
+            raise ValueError(f"model: {error}") from error
+        actuated(model, case.joints, case.kind)
 
 
 def _wait(process: "subprocess.Popen[bytes]", wall_seconds: float) -> tuple[float, int]:

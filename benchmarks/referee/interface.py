@@ -6,6 +6,8 @@ an empty list "nothing found".
 """
 
 import json
+import math
+from collections.abc import Container, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,6 +100,30 @@ class Answer:
 
     def to_json(self) -> dict[str, Any]:
         return {"schema": SCHEMA, **asdict(self)}
+
+
+def check(answer: Answer, case: Case, words: Mapping[str, Mapping[str, str]], effects: Container[str]) -> None:
+    """Raise ValueError with what an answer must not have: a number that is none, an interval or confidence that cannot
+    be, a joint that the model lacks, a vocabulary or cause that `families.json` (`words`, `effects`) does not have."""
+    if answer.vocabulary not in words:
+        raise ValueError(f"vocabulary {answer.vocabulary!r} is not in families.json, which has {', '.join(words)}")
+    for cause in answer.causes or ():
+        effect = words[answer.vocabulary].get(cause.name, cause.name).partition(":")[0]
+        if effect not in effects:
+            raise ValueError(f"cause {cause.name!r}: the vocabulary {answer.vocabulary!r} of families.json lacks it")
+        if not 0.0 <= cause.confidence <= 1.0:
+            raise ValueError(f"cause {cause.name!r}: confidence {cause.confidence} instead of 0 to 1")
+        if unknown := [joint for joint in cause.joints if joint not in case.joints]:
+            raise ValueError(f"cause {cause.name!r}: the model has no joint {unknown[0]!r}")
+    for p in answer.parameters or ():
+        what = f"parameter {p.name!r} of joint {p.joint!r}" if p.joint else f"parameter {p.name!r}"
+        if p.joint and p.joint not in case.joints:
+            raise ValueError(f"{what}: the model has no such joint")
+        stated = [x for x in (p.low, p.value, p.high, p.nominal) if x is not None]
+        if not all(map(math.isfinite, stated)):
+            raise ValueError(f"{what}: {p.value}, {p.low} to {p.high}, nominal {p.nominal} are not all finite numbers")
+        if (p.low is None) != (p.high is None) or (p.low is not None and not p.low <= p.value <= p.high):
+            raise ValueError(f"{what}: {p.value} is not between {p.low} and {p.high}")
 
 
 def answer_from_json(made: dict[str, Any]) -> Answer:

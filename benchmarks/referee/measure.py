@@ -67,19 +67,31 @@ def errors(xml: str, joints: tuple[str, ...], kind: str, recording: dict[str, An
     model, seen = mujoco.MjModel.from_xml_string(xml), even(recording)
     if len(seen.q) * STEP_S < 2.0 * SETTLING_S + 3.0 * POSITION_WINDOW_S:
         raise ValueError("the recording is too short")
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in joints]
-    if min(ids) < 0:
-        raise ValueError(f"the model lacks the joint {joints[ids.index(-1)]}")
+    ids, servos = actuated(model, joints, kind)
     at, dof = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
     if kind == "positions":
         window = round(POSITION_WINDOW_S / STEP_S)
         every = {"residual": window, "rollout": len(seen.q)}
-        moved = {name: _driven_by_commands(model, ids, seen, length) for name, length in every.items()}
+        moved = {name: _driven_by_commands(model, ids, servos, seen, length) for name, length in every.items()}
         return {name: float(np.hypot(error, FLOOR["position"])) for name, error in moved.items()}
     return {
         "residual": float(np.hypot(_residual(model, at, dof, seen), FLOOR["share"])),
         "rollout": float(np.hypot(_driven_by_torque(model, at, dof, seen), FLOOR["position"])),
     }
+
+
+def actuated(model: Any, joints: tuple[str, ...], kind: str) -> tuple[list[int], list[int]]:
+    """Numbers of the joints, and with positions alone of their actuators. Raises ValueError where one is missing."""
+    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in joints]
+    if min(ids) < 0:
+        raise ValueError(f"model: it lacks the joint {joints[ids.index(-1)]}")
+    servos = []
+    for name, joint in zip(joints, ids, strict=True) if kind == "positions" else ():
+        found = np.flatnonzero((model.actuator_trntype == 0) & (model.actuator_trnid[:, 0] == joint))
+        if not len(found):
+            raise ValueError(f"model: it has no actuator at joint {name}")
+        servos.append(int(found[0]))
+    return ids, servos
 
 
 def _residual(model: Any, at: Any, dof: Any, seen: Even) -> float:
@@ -125,15 +137,9 @@ def _driven_by_torque(model: Any, at: Any, dof: Any, seen: Even) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def _driven_by_commands(model: Any, ids: Any, seen: Even, length: int) -> float:
+def _driven_by_commands(model: Any, ids: Any, servos: list[int], seen: Even, length: int) -> float:
     """RMS over windows of this length and joints of the position error under the recorded commands [rad]."""
     at, dof = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    servos = []
-    for joint in ids:
-        found = np.flatnonzero((model.actuator_trntype == 0) & (model.actuator_trnid[:, 0] == joint))
-        if not len(found):
-            raise ValueError(f"the model has no actuator at joint {model.joint(joint).name}")
-        servos.append(int(found[0]))
     model.opt.timestep = STEP_S
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     settling, squares, data = round(SETTLING_S / STEP_S), [], mujoco.MjData(model)

@@ -1,6 +1,6 @@
 """Values of a nominal model, and the model with other values: what adapters share that answer MuJoCo's quantities."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -10,6 +10,18 @@ from referee.interface import Case, Parameter
 
 QUANTITIES = ("frictionloss", "damping", "armature", "kp")
 """`damping` is the joint's, and with positions alone the servo's too, since a position cannot tell them."""
+EFFECTS = {
+    "frictionloss": "friction.coulomb",
+    "damping": "friction.viscous",
+    "armature": "actuator.rotor_inertia",
+    "mass": "link.payload",
+}
+"""What may be withheld of them (`Case.withheld`)."""
+
+
+def allowed(case: Case, quantities: Iterable[str]) -> list[str]:
+    """The quantities that a tool may estimate in this case."""
+    return [quantity for quantity in quantities if EFFECTS.get(quantity) not in case.withheld]
 
 
 def spec_of(case: Case) -> Any:

@@ -1,6 +1,7 @@
 """The table of a round as Markdown, and its picture as SVG."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -45,8 +46,7 @@ def _round(made: Mapping[str, Any]) -> str:
         "|---|" + "---|" * len(tools),
     ]
     for score in SCORES:
-        absent = found["not_offered"][score.key]
-        cells = [_cell(found["scores"][score.key][tool], score, tool not in absent) for tool in tools]
+        cells = [_cell(found, score, tool) for tool in tools]
         lines.append(f"| {score.title} | " + " | ".join(cells) + " |")
     lines.append(
         "| cases answered / failed / out of time | " + " | ".join(_states(made, tool) for tool in tools) + " |"
@@ -60,9 +60,13 @@ def _round(made: Mapping[str, Any]) -> str:
             f"In {counted[0]} of {counted[1]} cases, armlink is at most 5 % above the best other tool in this score"
         )
         lines += ["", f"{better}: {title}."]
-    missing = {row["tool"]: row["why"] for row in made["rows"] if row["state"] == "not installed"}
-    lines += ["", *(f"`{tool}` is not installable here: {why}." for tool, why in missing.items())] if missing else []
-    return "\n".join(lines)
+    told = Counter((row["tool"], row["state"], row["why"]) for row in made["rows"])
+    reasons = [
+        f"- `{tool}` {state} ({count} case{'s' * (count > 1)}): {' '.join(why.split())}"
+        for (tool, state, why), count in told.items()
+        if state in ("failed", "not installed")
+    ]
+    return "\n".join([*lines, "", "Failures:", "", *reasons] if reasons else lines)
 
 
 def _title(made: Mapping[str, Any]) -> str:
@@ -70,9 +74,17 @@ def _title(made: Mapping[str, Any]) -> str:
     return f"{'Seeds' if len(made['seeds']) > 1 else 'Seed'} {seeds}: {made['cases']} cases, {made['date']}"
 
 
-def _cell(found: Mapping[str, Any] | None, score: Score, offered: bool) -> str:
+def _empty(summary: Mapping[str, Any], score: Score, tool: str) -> str:
+    """Why a tool has no value."""
+    if tool in summary["no_answer"]:
+        return "no answer"
+    return "not offered" if tool in summary["not_offered"][score.key] else "no case"
+
+
+def _cell(summary: Mapping[str, Any], score: Score, tool: str) -> str:
+    found = summary["scores"][score.key][tool]
     if found is None:
-        return "no case" if offered else "not offered"
+        return _empty(summary, score, tool)
     unit = 100.0 if score.share else 1.0
     value, low, high = (f"{unit * found[name]:.{'0f' if score.share else '3g'}}" for name in ("value", "low", "high"))
     return f"{value}{' %' if score.share else ''} ({low} to {high}; {found['cases']})"
@@ -123,7 +135,7 @@ def svg(made: Mapping[str, Any]) -> str:
 
 
 def _panel(summary: Mapping[str, Any], score: Score) -> list[str]:
-    found, tools, absent = summary["scores"][score.key], summary["tools"], summary["not_offered"][score.key]
+    found, tools = summary["scores"][score.key], summary["tools"]
     most = max([each["high"] for each in found.values() if each] + [1.0])
 
     def place(value: float) -> float:
@@ -141,8 +153,7 @@ def _panel(summary: Mapping[str, Any], score: Score) -> list[str]:
         y, each = HEAD_PX + ROW_PX * row, found[tool]
         out.append(f'<text x="4" y="{y + 4}">{escape(tool)}</text>')
         if each is None:
-            why = "not offered" if tool in absent else "no case"
-            out.append(f'<text x="{LABEL_PX + 6}" y="{y + 4}" fill="#999">{why}</text>')
+            out.append(f'<text x="{LABEL_PX + 6}" y="{y + 4}" fill="#999">{_empty(summary, score, tool)}</text>')
             continue
         colour = "#c03" if tool == "armlink" else "#36c"
         low, value, high = (place(each[name]) for name in ("low", "value", "high"))

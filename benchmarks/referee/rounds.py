@@ -99,7 +99,8 @@ def _answer(tools: list[contest.Tool], out: Path, hashes: dict[str, str], option
             return f"{case} {tool.name}: no time is left"
         row = {"tool": tool.name, "case": case, **contest.run(tool, out / "cases" / case, options.cpu_seconds)}
         (out / "answers" / f"{case}--{tool.name}.json").write_text(json.dumps(row), encoding="utf-8")
-        return f"{case} {tool.name}: {row['state']} after {row['cpu_seconds']:.0f} s of a core"
+        why = f": {row['why']}" if row["state"] == "failed" else ""
+        return f"{case} {tool.name}: {row['state']} after {row['cpu_seconds']:.0f} s of a core{why}"
 
     with ThreadPoolExecutor(options.workers) as pool:
         jobs = [pool.submit(answer, *each) for each in todo]
@@ -112,7 +113,7 @@ def _sim(out: Path, case: str) -> str:
 
 
 def score_row(row: Json, opened: Json, nominal: str) -> Json:
-    """A row of the result: scores of one answer. A model that MuJoCo refuses counts as none, and the row says why."""
+    """A row of the result: scores of one answer."""
     label, held = opened["label"], opened["heldout"]
     nameable = any(e["effect"] not in label["withheld"] for e in label["effects"])
     kept = {name: row.get(name, "") for name in ("tool", "case", "state", "why", "cpu_seconds")}
@@ -123,11 +124,7 @@ def score_row(row: Json, opened: Json, nominal: str) -> Json:
         made["offers"] = score.offers(answer)
         scores = score.judge(answer, label) | {"cpu_seconds": row["cpu_seconds"]}
         if answer.model is not None:
-            before = errors(nominal, tuple(label["joints"]), label["kind"], held)
-            try:
-                after = errors(answer.model, tuple(label["joints"]), label["kind"], held)
-                scores |= {name: after[name] / before[name] for name in before}
-            except ValueError as error:
-                scores |= dict.fromkeys(before, score.FAILED_RATIO)
-                made["why"] = f"model: {error}"
+            of_arm = tuple(label["joints"]), label["kind"], held
+            before, after = errors(nominal, *of_arm), errors(answer.model, *of_arm)
+            scores |= {name: after[name] / before[name] for name in before}
     return {**made, "scores": scores}

@@ -100,7 +100,8 @@ def judge(answer: Answer, label: Json) -> dict[str, float | None]:
             scores["abstains"] = float(not false)
     if answer.parameters is not None and whole:
         scores |= _parameter_scores(answer.parameters, words, label["truth"])
-        stated = [p for p in answer.parameters if p.low is not None and p.high is not None and p.nominal is not None]
+        compared = [p for p in answer.parameters if family(p.name, words) in TABLES["families"]]
+        stated = [p for p in compared if None not in (p.low, p.high, p.nominal)]
         if answer.causes is None and nameable and stated:
             scores["read_right"] = float(family(max(stated, key=_deviations).name, words) in right)
     return scores
@@ -174,8 +175,11 @@ def summary(rows: Sequence[dict[str, Any]], seed: int = 0) -> dict[str, Any]:
             made = {"score": score.key, "better": first, "worse": second, "cases": len(cases)}
             differences.append({**made, "decided": is_decided(better, WRONG_DECISIONS / len(pairs))})
     offered = {tool: {part for row in rows if row["tool"] == tool for part in row["offers"]} for tool in tools}
-    missing = {s.key: [t for t in tools if not s.needs <= offered[t]] for s in SCORES}
-    return {"tools": tools, "scores": table, "differences": differences, "not_offered": missing}
+    states = {tool: {row["state"] for row in rows if row["tool"] == tool} for tool in tools}
+    silent = [t for t in tools if "answered" not in states[t] and states[t] & {"failed", "out of time"}]
+    missing = {s.key: [t for t in tools if t not in silent and not s.needs <= offered[t]] for s in SCORES}
+    found = {"tools": tools, "scores": table, "differences": differences}
+    return {**found, "not_offered": missing, "no_answer": silent}
 
 
 def _by_case(rows: Sequence[dict[str, Any]], tool: str, key: str) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The referee: scores worked out by hand, the seal, and a small round with two adapters, one of them the page's."""
 
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -212,7 +213,7 @@ def test_adapters_are_short_and_on_the_page():
 def test_a_round_with_the_adapter_of_the_page(tmp_path, monkeypatch):
     """Half of the time is MuJoCo's: one arm, three recordings of six seconds."""
     monkeypatch.setattr(mujoco_plant, "SECONDS", 6.0)
-    code = next(text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "ridge" in text)
+    code = next(text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "Ridge" in text)
     (tmp_path / "ridge.py").write_text(code, encoding="utf-8")
     (tmp_path / "sealed").mkdir()
     case, digest = draw.draw_case(3, 0, "MuJoCo, motor torque, one effect", tmp_path, b"k" * 32, 60.0, None)
@@ -251,4 +252,39 @@ def test_a_tool_that_is_not_there_or_never_ends_is_said_so(tmp_path, monkeypatch
     states = {tool.name: contest.run(tool, tmp_path / "case", 2.0) for tool in tools}
     assert states["endless"]["state"] == "out of time"
     assert states["absent"]["state"] == "not installed"
-    assert (states["sick"]["state"], states["sick"]["why"]) == ("failed", "KeyError: 'no'")
+    assert (states["sick"]["state"], states["sick"]["why"]) == ("failed", "KeyError: 'no', line 2")
+
+
+FRICTION = ("frictionloss", "joint_1")
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (Answer("words", []), "vocabulary 'words' is not in families.json"),
+        (Answer("mujoco", [Cause("frictionlos", ("joint_1",), 0.9)]), "cause 'frictionlos': the vocabulary 'mujoco'"),
+        (Answer("mujoco", [Cause("damping", ("joint_1",), 3.0)]), "confidence 3.0 instead of 0 to 1"),
+        (Answer("mujoco", [Cause("damping", ("joint_1",), math.nan)]), "confidence nan"),
+        (Answer("mujoco", [Cause("damping", ("elbow",), 0.9)]), "the model has no joint 'elbow'"),
+        (Answer("mujoco", None, [Parameter("damping", "elbow", 0.1)]), "of joint 'elbow': the model has no such joint"),
+        (Answer("mujoco", None, [Parameter(*FRICTION, math.nan)]), "are not all finite numbers"),
+        (Answer("mujoco", None, [Parameter(*FRICTION, 0.1, 0.2, 0.0)]), "0.1 is not between 0.2 and 0.0"),
+        (Answer("mujoco", None, None, "no model"), "model: XML parse error"),
+        (Answer("mujoco", None, None, "<mujoco/>"), "model: it lacks the joint joint_1"),
+    ],
+)
+def test_an_answer_that_cannot_be_judged_is_a_failure_with_its_reason(tmp_path, answer, said):
+    told = {"joints": ["joint_1"], "kind": "torque", "withheld": [], "cpu_seconds": 5.0}
+    (tmp_path / "case.json").write_text(json.dumps(told), encoding="utf-8")
+    with pytest.raises(ValueError, match=said):
+        contest.judgeable(answer, tmp_path)
+    good = Parameter(*FRICTION, 0.1, 0.0, 0.2, 0.0)
+    contest.judgeable(Answer("mujoco", [Cause("damping", ("joint_1",), 0.9)], [good]), tmp_path)
+
+
+def test_a_tool_that_always_fails_is_not_one_that_offers_nothing():
+    rows = [row("armlink", "1", residual=0.5), {**row("peer", "1", "failed"), "why": "KeyError: 'no'", "offers": []}]
+    made = {"seeds": [1], "date": "2026-11-30", "cases": 1, "cpu_seconds": 60.0, "sealed": ["0" * 64], "rows": rows}
+    text = page.markdown([{**made, "summary": score.summary(rows), "no_worse": {}}])
+    assert re.search(r"\| held-out residual / that of the nominal model \|.*\| no answer \|", text)
+    assert "- `peer` failed (1 case): KeyError: 'no'" in text

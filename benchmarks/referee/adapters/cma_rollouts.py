@@ -15,7 +15,6 @@ from referee.signals import SEARCH_SHARE, at, drive, held, windows
 STEP_S, WINDOWS, SECONDS, LONGEST_DELAY_S = 0.004, 16, {"positions": 3.0}, 0.08
 SHARES = {"frictionloss": 0.5, "damping": 0.5, "armature": 0.3}
 """Largest values sought, as shares of a joint's largest torque in training; at least five times the nominal value."""
-WITHHELD = {"friction.coulomb": "frictionloss", "friction.viscous": "damping", "actuator.rotor_inertia": "armature"}
 
 
 def solve(case: Case) -> Answer:
@@ -23,7 +22,7 @@ def solve(case: Case) -> Answer:
     order, model = [names.index(servo.target) for servo in spec.actuators], spec.compile()
     clock = np.arange(round(SECONDS.get(case.kind, 0.4) / STEP_S)) * STEP_S
     data, dofs = mujoco.MjData(model), {name: int(model.joint(name).dofadr[0]) for name in names}
-    sought = [q for q in SHARES if q not in [WITHHELD.get(each) for each in case.withheld]]
+    sought = mjcf.allowed(case, SHARES)
     keys, top = [(q, name) for q in sought for name in names], np.outer([SHARES[q] for q in sought], mjcf.largest(case))
     start = np.array([mjcf.value_of(spec, *key) for key in keys])
     top = np.maximum(5.0 * start, top.ravel() + 1e-3)

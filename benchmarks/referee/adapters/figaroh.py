@@ -32,6 +32,8 @@ def solve(case: Case) -> Answer:
     full = build_regressor_basic(SimpleNamespace(model=model, data=model.createData()), q, v, a, config)
     names = [f"{word}{i}" for i in range(n) for word in INERTIAL]
     names += [f"{block} {joint}" for block in blocks(full, v, a, n) for joint in case.joints]
+    allowed = mjcf.allowed(case, WORDS.values())
+    full[:, [WORDS.get(name.partition(" ")[0], "") not in allowed for name in names]] = 0.0  # withheld
     dropped, kept = get_index_eliminate(full, dict.fromkeys(names))
     moving = (np.abs(v) > LEAST_SPEED).T.ravel()
     side, reduced = torque.T.ravel()[moving], np.delete(full, dropped, axis=1)[moving]

@@ -21,7 +21,9 @@ def solve(case: Case) -> Answer:
     model.gravity.linear, data = np.array(mjcf.spec_of(case).option.gravity), model.createData()
     q, v, a, torque = motion(case)
     rows = np.array([pin.computeJointTorqueRegressor(model, data, *each) for each in zip(q, v, a, strict=True)])
-    own = [np.einsum("kj,ij->kij", x, np.eye(n)) for x in (np.sign(v), v, a)]
+    causes = {"frictionloss": np.sign(v), "damping": v, "armature": a}
+    sought = mjcf.allowed(case, causes)
+    own = [np.einsum("kj,ij->kij", causes[quantity], np.eye(n)) for quantity in sought]
     nominal = np.concatenate([inertia.toDynamicParameters() for inertia in model.inertias[1 : n + 1]])
     left = torque - rows @ nominal
     weight = 1.0 / left.std(0)
@@ -32,7 +34,7 @@ def solve(case: Case) -> Answer:
     variance = np.sum((side - design / scale @ solution) ** 2) / (side.size - rank)
     spread = variance * np.linalg.pinv((design / scale).T @ (design / scale), rcond=SMALLEST**2)
     half = 1.96 * np.sqrt(np.clip(np.diag(spread), 0.0, None)) / scale
-    keys = [(quantity, name) for quantity in ("frictionloss", "damping", "armature") for name in case.joints]
+    keys = [(quantity, name) for quantity in sought for name in case.joints]
     found = dict(zip(keys, np.maximum(solution / scale, 0.0)[10 * n :].tolist(), strict=True))
     widths = dict(zip(keys, half[10 * n :].tolist(), strict=True))
     moved = nominal + (solution / scale)[: 10 * n]

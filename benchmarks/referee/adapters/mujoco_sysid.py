@@ -15,7 +15,6 @@ from referee.interface import Answer, Case
 from referee.signals import SEARCH_SHARE, drive, windows
 
 STEP_S, WINDOWS, SECONDS = 0.004, 24, {"positions": 3.0}
-WITHHELD = {"friction.coulomb": "frictionloss", "friction.viscous": "damping", "actuator.rotor_inertia": "armature"}
 
 
 def solve(case: Case) -> Answer:
@@ -24,15 +23,15 @@ def solve(case: Case) -> Answer:
         kind = {"type": mujoco.mjtSensor.mjSENS_JOINTPOS, "objtype": mujoco.mjtObj.mjOBJ_JOINT}
         spec.add_sensor(name=f"{name} at", objname=name, **kind)
     wanted, model = sysid.ParameterDict(), spec.compile()
-    for quantity in mjcf.QUANTITIES if case.kind == "positions" else mjcf.QUANTITIES[:3]:
-        if quantity not in [WITHHELD.get(each) for each in case.withheld]:
-            for name, torque in zip(names, mjcf.largest(case), strict=True):
-                start = mjcf.value_of(spec, quantity, name)
-                high = max(5.0 * start, {"frictionloss": 0.5, "damping": 1.0}.get(quantity, 0.0) * torque + 1e-3)
-                low = 0.2 * start if quantity == "kp" else 0.0
-                add(wanted, quantity, name, float(np.clip(start, 0.01 * high, 0.99 * high)), low, high)
+    for quantity in mjcf.allowed(case, mjcf.QUANTITIES if case.kind == "positions" else mjcf.QUANTITIES[:3]):
+        for name, torque in zip(names, mjcf.largest(case), strict=True):
+            start = mjcf.value_of(spec, quantity, name)
+            high = max(5.0 * start, {"frictionloss": 0.5, "damping": 1.0}.get(quantity, 0.0) * torque + 1e-3)
+            low = 0.2 * start if quantity == "kp" else 0.0
+            add(wanted, quantity, name, float(np.clip(start, 0.01 * high, 0.99 * high)), low, high)
     last = mjcf.value_of(spec, "mass", names[-1])
-    add(wanted, "mass", names[-1], last, 0.5 * last, 3.0 * last + 1.0)
+    for quantity in mjcf.allowed(case, ["mass"]):
+        add(wanted, quantity, names[-1], last, 0.5 * last, 3.0 * last + 1.0)
     states, controls, seen = [], [], []
     for r, part, speed in windows(case, SECONDS.get(case.kind, 0.5), WINDOWS):
         t, sensed = r.t[part] - r.t[part.start], [(f"{name} at", sysid.SignalType.MjSensor) for name in names]
