@@ -227,13 +227,13 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
 def show(answer: "Diagnosis", console: "Console") -> None:
     from rich.table import Column
 
-    from sim_gap.report.effect_text import parameter_rows
+    from sim_gap.report.effect_text import parameter_rows, rivals_of
 
     rows = []
     for cause in answer.causes:
         joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
         numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
-        rows.append((cause.effect, joints, *numbers, ", ".join(cause.confounded_with)))
+        rows.append((cause.effect, joints, *numbers, rivals_of(cause, ", ")))
     if rows:
         of_cause = Column("effect", no_wrap=True), "joints", "RMS before", "after", "confidence", "confounded with"
         print_table(console, of_cause, rows, "causes, on held-out data")

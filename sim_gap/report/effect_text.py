@@ -4,6 +4,8 @@ from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 
 WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
+NAMED = 4
+"""Number of effects that fit as well which a text names; the JSON answer has all."""
 CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd": "commanded torque"}
 """Torque channels of a recording, for people."""
 
@@ -36,10 +38,18 @@ def sentence(answer: Diagnosis) -> str:
         hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)
         return f"Cause ambiguous: {first.effect} fits, but part of the explanation is only a hint: {hints}"
     if answer.verdict == "ambiguous":
-        rivals = " or ".join(first.confounded_with)
+        rivals = rivals_of(first, " or ")
         return f"Cause ambiguous: {first.effect} fits, but {rivals} fits as well; to separate them, {first.separate_by}"
     share = f"{1.0 - answer.unexplained:.0%}"
     return f"Gap explained: {share} of the gap on held-out data, most of it by {first.effect}"
+
+
+def rivals_of(cause: Cause, between: str) -> str:
+    """The effects that fit as well, the first of them where they are many."""
+    names = cause.confounded_with
+    if len(names) > NAMED + 1:
+        names = (*names[:NAMED], f"{len(names) - NAMED} others")
+    return between.join(names)
 
 
 def parameter_rows(cause: Cause) -> list[list[str]]:

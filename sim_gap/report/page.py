@@ -10,7 +10,7 @@ from calib.report.page import html_of, paragraph, paragraphs, render, verdict_li
 from calib.report.tables import ReportTable
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified
-from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence
+from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, rivals_of, sentence
 from sim_gap.report.figures import (
     cause_figure,
     gap_bars,
@@ -112,8 +112,7 @@ def _cause_row(cause: Cause) -> list[str]:
     if cause.effect in CATALOGUE:  # effects of a position controller are not: no sweep knows them
         effect += html_of("<br><small>{}</small>", CATALOGUE[cause.effect].description)
     if cause.confounded_with:
-        others = ", ".join(cause.confounded_with)
-        effect += html_of("<br><small>or {}: {}</small>", others, cause.separate_by or "")
+        effect += html_of("<br><small>or {}: {}</small>", rivals_of(cause, ", "), cause.separate_by or "")
     return [
         effect,
         ", ".join(cause.joints),

@@ -82,12 +82,12 @@ def _replay(arm: Simulated, recording: Recording) -> Array:
     import mujoco
 
     model, joints = arm.model, list(arm.joints)
-    given, rows = recording.position_command, len(recording.t)
-    assert given is not None
-    data = mujoco.MjData(model)
+    assert recording.position_command is not None
+    data, rows = mujoco.MjData(model), len(recording.t)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
     drives = [actuator_of(model, joint) for joint in joints]
+    given = recording.position_command * model.actuator_gear[drives, 0]
     hold(model, data, drives, given[0])
     controls = model.actuator_ctrladr[drives]
     dt, held = float(model.opt.timestep), HeldParts.of(model, joints)

@@ -109,6 +109,15 @@ def test_a_recording_with_another_gain_is_replayed_with_that_gain(tmp_path: Path
     np.testing.assert_allclose(2.0 * apart, both)
 
 
+def test_commands_are_angles_of_the_joint_whatever_the_gear() -> None:
+    plain, geared = (mujoco.MjSpec.from_string(model_text(kp=GAIN, friction=0.2)) for _ in range(2))
+    for actuator in geared.actuators:
+        actuator.gear[0] = 3.0
+        actuator.gainprm, actuator.biasprm = actuator.gainprm / 9.0, actuator.biasprm / 9.0
+    moved = [replay(Simulated(spec.compile(), (0, 1)), OTHER)[1] for spec in (plain, geared)]
+    np.testing.assert_allclose(*moved, atol=1e-9)
+
+
 @pytest.mark.parametrize("compiler", ["", '<compiler angle="radian"/>'])
 def test_a_spring_is_written_in_the_angles_of_the_file(made, tmp_path: Path, compiler: str) -> None:
     _, search, fit = made
