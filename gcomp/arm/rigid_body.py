@@ -1,4 +1,4 @@
-"""Rigid-body torque of an open chain of hinges, and its exact regressor in every link's ten inertial parameters.
+"""Rigid-body torque of a chain of hinges and slides, and its exact regressor in every link's inertial parameters.
 
 The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ rows take less than a second. Whoever
 makes one of a MuJoCo model checks it against `mj_inverse`.
@@ -18,9 +18,11 @@ CREEP = 0.01
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-LinkMotion = tuple[Sequence[Array], list[tuple[Array, Array, Array]]]
-"""Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
-less gravity, in its own frame, (3, K) each."""
+Frame = tuple[Array, Array]
+"""Rotation (3, 3, K) and origin [m] (3, K), or (3, 1) if it does not move, of a link in its parent's frame."""
+LinkMotion = tuple[Sequence[Frame], list[tuple[Array, Array, Array]]]
+"""Frame of each link; angular velocity, angular acceleration and acceleration of its origin less gravity, in its own
+frame, (3, K) each."""
 POSITION_STEP = 1e-5
 """Step of differences in a position [rad]: rounding and curvature then leave 1e-10 of the torque."""
 
@@ -45,7 +47,10 @@ class Tendons:
 
 @dataclass(frozen=True)
 class RigidArm:
-    """An arm of n hinges: geometry, nominal inertial parameters, and the model's own joint terms."""
+    """An arm of n hinges and slides: geometry, nominal inertial parameters, and the model's own joint terms.
+
+    The position of a slide is in m and its torque a force in N, and so on in all units of joints.
+    """
 
     names: tuple[str, ...]
     parent: tuple[int, ...]
@@ -56,6 +61,8 @@ class RigidArm:
     """Origin of the link frame (on the joint axis) in the parent link's frame [m], (n, 3)."""
     axis: Array
     """Joint axis in the link frame, (n, 3)."""
+    slides: Mask
+    """Joints that slide along their axis instead of turning about it, (n,)."""
     zero: Array
     """Joint position at angle zero (MuJoCo's qpos0) [rad], (n,)."""
     range: Array
@@ -79,6 +86,12 @@ class RigidArm:
     @property
     def n(self) -> int:
         return len(self.names)
+
+    def unit_at(self, joint: int, unit: str) -> str:
+        """A unit of a hinge as this joint has it: of a slide N for N·m, m for rad, and kg for kg·m²."""
+        if not self.slides[joint] or "(N·m)" in unit:
+            return unit
+        return unit.replace("N·m", "N").replace("kg·m²", "kg").replace("rad", "m")
 
     @cached_property
     def carries(self) -> Mask:
@@ -111,26 +124,27 @@ class RigidArm:
         return reach
 
     def torque(
-        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, frames: Sequence[Frame] | None = None
     ) -> Array:
         """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n).
 
-        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's; `turns` as in
+        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's; `frames` as in
         `motion`.
         """
-        turns, moves = self.motion(q, v, a, gravity, turns=turns)
+        frames, moves = self.motion(q, v, a, gravity, frames=frames)
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
             mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], symmetric(self.inertial[j, 4:])
             forces.append(mass * push + cross(alpha, moment) + cross(omega, cross(omega, moment)))
             couples.append(inertia @ alpha + cross(omega, inertia @ omega) - cross(push, moment))
         for j in reversed(range(self.n)):
-            up = self.parent[j]
+            up, (turn, origin) = self.parent[j], frames[j]
             if up >= 0:
-                force = out_of_frame(turns[j], forces[j])
+                force = out_of_frame(turn, forces[j])
                 forces[up] = forces[up] + force
-                couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
-        return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
+                couples[up] = couples[up] + out_of_frame(turn, couples[j]) - cross(force, origin)
+        loads = [forces[j] if slides else couples[j] for j, slides in enumerate(self.slides)]
+        return np.stack([axis @ load for axis, load in zip(self.axis, loads, strict=True)], axis=1)
 
     def gravity_torque(self, q: Array, gravity: Array | None = None) -> Array:
         """`torque` at rest."""
@@ -138,7 +152,7 @@ class RigidArm:
 
     def link_regressor(self, motion: LinkMotion, link: int) -> Array:
         """Columns of `torque` in the ten inertial parameters of one link, (K, n, 10); zero where it is not carried."""
-        turns, moves = motion
+        frames, moves = motion
         rows = moves[link][0].shape[1]
         out = np.zeros((self.n, 10, rows))
         down = np.eye(3)[:, :, None]  # from the frame of a joint to the link's
@@ -146,35 +160,44 @@ class RigidArm:
         i = link
         while i >= 0:
             axis = np.broadcast_to(np.einsum("ijk,j->ik", down, self.axis[i]), (3, rows))
-            out[i] = _link_columns(axis, cross(axis, np.broadcast_to(lever, (3, rows))), *moves[link])
-            down = np.einsum("ijk,ljk->ilk", down, turns[i])
-            lever = lever + np.einsum("ijk,j->ik", down, self.offset[i])
+            if self.slides[i]:
+                out[i] = _link_columns(np.zeros_like(axis), axis, *moves[link])
+            else:
+                out[i] = _link_columns(axis, cross(axis, np.broadcast_to(lever, (3, rows))), *moves[link])
+            turn, origin = frames[i]
+            down = np.einsum("ijk,ljk->ilk", down, turn)
+            lever = lever + np.einsum("ijk,jk->ik", down, origin)
             i = self.parent[i]
         return np.moveaxis(out, -1, 0)
 
-    def turn(self, joint: int, q: Array) -> Array:
-        """Rotation of a link against the one before it, at its joint's positions (K,) [rad], (3, 3, K)."""
-        return turned(self.rotation[joint], self.axis[joint], q - self.zero[joint])
+    def frame(self, joint: int, q: Array) -> Frame:
+        """Frame of a link at its joint's positions (K,) [rad]."""
+        rotation, axis, away = self.rotation[joint], self.axis[joint], q - self.zero[joint]
+        if self.slides[joint]:
+            turn = np.broadcast_to(rotation[..., None], (3, 3, len(q)))
+            return turn, self.offset[joint][:, None] + np.outer(rotation @ axis, away)
+        return turned(rotation, axis, away), self.offset[joint][:, None]
 
     def motion(
-        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, turns: Sequence[Array] | None = None
+        self, q: Array, v: Array, a: Array, gravity: Array | None = None, *, frames: Sequence[Frame] | None = None
     ) -> LinkMotion:
-        """How the links move, from base to tip; `turns` are their rotations at q, where they are known."""
+        """How the links move, from base to tip; `frames` are theirs at q, where they are known."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
         base = still, still, still - np.asarray(field, float)[:, None]
-        turns = turns or [self.turn(j, q[:, j]) for j in range(self.n)]
+        frames = frames or [self.frame(j, q[:, j]) for j in range(self.n)]
         moves: list[tuple[Array, Array, Array]] = []
-        for j, turn in enumerate(turns):
+        for j, (turn, lever) in enumerate(frames):
             omega, alpha, push = moves[self.parent[j]] if self.parent[j] >= 0 else base
             if self.parent[j] >= 0:
-                lever = self.offset[j]
                 push = push + cross(alpha, lever) + cross(omega, cross(omega, lever))
             omega, alpha, push = into_frame(turn, omega), into_frame(turn, alpha), into_frame(turn, push)
-            spin = self.axis[j][:, None] * v[:, j]
-            alpha = alpha + self.axis[j][:, None] * a[:, j] + cross(omega, spin)
-            moves.append((omega + spin, alpha, push))
-        return turns, moves
+            speed, gain = self.axis[j][:, None] * v[:, j], self.axis[j][:, None] * a[:, j]
+            if self.slides[j]:
+                moves.append((omega, alpha, push + gain + 2.0 * cross(omega, speed)))
+            else:
+                moves.append((omega + speed, alpha + gain + cross(omega, speed), push))
+        return frames, moves
 
     def carried(self, q: Array, v: Array, a: Array) -> Array:
         """Torque that the links take of a motor: `torque` and that of the springs across the joints [N·m], (K, n)."""
@@ -205,7 +228,7 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
 
 
 def cross(x: Array, y: Array) -> Array:
-    """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
+    """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,) or (3, 1)."""
     out = np.empty_like(x)
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.multiply(x[i], y[j], out=out[k])
@@ -236,20 +259,21 @@ def turned(start: Array, axis: Array, angle: Array | float) -> Array:
 
 
 def torque_slopes(
-    arm: RigidArm, turns: Sequence[Array], q: Array, v: Array, a: Array, joint: int
+    arm: RigidArm, frames: Sequence[Frame], q: Array, v: Array, a: Array, joint: int
 ) -> tuple[Array, Array, Array]:
-    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each; `turns` are the links' rotations at q.
+    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each; `frames` are those of the links at q.
 
     By central differences in q and v, which are exact in v: the torque is quadratic in it. ∂τ/∂a is a column of M(q).
     """
     unit = np.eye(arm.n)[joint]
 
-    def changed(angle: float, speed: float) -> Array:
-        own = turns
-        if angle:
-            own = [*turns[:joint], arm.turn(joint, q[:, joint] + angle), *turns[joint + 1 :]]
-        return arm.torque(q, v + speed * unit, a, turns=own)
+    def changed(way: float, speed: float) -> Array:
+        own = frames
+        if way:
+            own = [*frames[:joint], arm.frame(joint, q[:, joint] + way), *frames[joint + 1 :]]
+        return arm.torque(q, v + speed * unit, a, frames=own)
 
     by_position = (changed(POSITION_STEP, 0.0) - changed(-POSITION_STEP, 0.0)) / (2.0 * POSITION_STEP)
     by_velocity = (changed(0.0, 1.0) - changed(0.0, -1.0)) / 2.0
-    return by_position, by_velocity, arm.torque(q, np.zeros_like(v), np.zeros_like(a) + unit, np.zeros(3), turns=turns)
+    still = np.zeros_like(v)
+    return by_position, by_velocity, arm.torque(q, still, still + unit, np.zeros(3), frames=frames)

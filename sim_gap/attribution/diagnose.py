@@ -42,7 +42,7 @@ from sim_gap.checks.check import (
 )
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.effects.registry import library_without
-from sim_gap.model.load import KnownGains, SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
+from sim_gap.model.load import KnownGains, SimModel, ends_of, joints_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps, without_disturbances
 from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, by_joint, locate, residual_sets, row_rms
@@ -118,7 +118,7 @@ def diagnose(
         made = diagnose_positions(
             sim, train, heldout, labels, withhold=withhold, heldout_is=heldout_is, gains=gains, progress=progress
         )
-        return replace(made, checks=findings)
+        return replace(made, checks=findings, notes=(*made.notes, *_units_note(sim)))
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(
@@ -145,10 +145,15 @@ def diagnose(
     made = _answer(Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor, heldout_is)
     compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
-    aside = (*told, *unchecked_note(recordings))
+    aside = (*told, *unchecked_note(recordings), *_units_note(sim))
     made = replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
     settled = not made.doubts or made.verdict == "unexplained"
     return made if settled else replace(made, verdict="ambiguous")
+
+
+def _units_note(sim: SimModel) -> tuple[str, ...]:
+    slides = ", ".join(name for name, slides in zip(sim.arm.names, sim.arm.slides, strict=True) if slides)
+    return (f"{slides}: of prismatic joints the gap is in N or m, not in N·m or rad",) if slides else ()
 
 
 def _answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
@@ -266,15 +271,15 @@ def checked_recordings(
     was found in them. Raises BadInput, for gains where the recordings have a torque channel too."""
     compiled_model = load_compiled(source)
     own_base, own_tip = ends_of(source)
-    hinges = hinges_between(compiled_model, base or own_base, tip or own_tip)
+    joints = joints_between(compiled_model, base or own_base, tip or own_tip)
     matched, findings = [], []
     for recording, label in zip(recordings, labels, strict=False):
-        taken, found = match_joints(recording, list(hinges), stated, label)
+        taken, found = match_joints(recording, list(joints), stated, label)
         matched.append(stated.apply(taken, label).check(label))
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     path = Path(source) if isinstance(source, str | Path) else None
-    sim = load_model(compiled_model, names, matched[0].n, hinges, path)
+    sim = load_model(compiled_model, names, matched[0].n, joints, path)
     alone = all(is_position_only(recording) for recording in matched)
     require_length(matched, labels, 0.0 if alone else SHORTEST_PIECE_S)
     if alone:

@@ -143,9 +143,9 @@ def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
     """Write what a copy of the compiled model has of the arm's joints and links into its file's specification: one way
     to a file for what torques and what positions have shown."""
     write_bodies(spec, sim.mujoco_model, model)
-    for number in sim.joints:
+    for place, number in enumerate(sim.joints):
         joint, dof, adr = spec.joints[number], model.jnt_dofadr[number], model.jnt_qposadr[number]
-        unit = float(np.degrees(1.0)) if joint.compiler.degree else 1.0
+        unit = float(np.degrees(1.0)) if joint.compiler.degree and not sim.arm.slides[place] else 1.0
         joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
         joint.damping[0] = float(linear_part(model.dof_damping, model.nv)[dof])
         joint.stiffness[0] = float(linear_part(model.jnt_stiffness, model.njnt)[number])

@@ -1,5 +1,6 @@
 """The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -107,15 +108,33 @@ def nominal_model(path: Path) -> Any:
     raise BadInput(f"{path} has no masses: give kinematics.model (URDF or MJCF), the key sim, or --sim MJCF")
 
 
-def hinges_of(model: Any) -> dict[str, int]:
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in hinges}
+def joints_of(model: Any) -> dict[str, int]:
+    """Joints that an arm may have, with their ids: hinges, and slides but for those of a hand (named so, coupled, or
+    several on one body)."""
+    named = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in range(model.njnt)}
+    slides = {name: j for name, j in named.items() if is_slide(model, j)}
+    carriers = Counter(int(model.body_parentid[model.jnt_bodyid[j]]) for j in slides.values())
+    coupled = coupled_joints(model)
+
+    def of_the_arm(name: str, joint: int) -> bool:
+        alone = carriers[int(model.body_parentid[model.jnt_bodyid[joint]])] == 1
+        return alone and name not in coupled and not HAND.search(name)
+
+    return {
+        name: j
+        for name, j in named.items()
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE or (name in slides and of_the_arm(name, j))
+    }
 
 
-def hinges_between(model: Any, base: str | None, tip: str | None) -> dict[str, int]:
-    """Hinges that body `base` carries (default: the world) on the way to body `tip` (default: all). Raises BadInput."""
+def is_slide(model: Any, joint: int) -> bool:
+    return bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def joints_between(model: Any, base: str | None, tip: str | None) -> dict[str, int]:
+    """Joints that body `base` carries (default: the world) on the way to body `tip` (default: all). Raises BadInput."""
     if base is None and tip is None:
-        return hinges_of(model)
+        return joints_of(model)
     first = 0 if base is None else _body(model, base, "base")
     last = None if tip is None else upwards(model, _body(model, tip, "tip"))
     if last is not None and first not in last:
@@ -123,25 +142,25 @@ def hinges_between(model: Any, base: str | None, tip: str | None) -> dict[str, i
             f"--base {base} --tip {tip}: the base body does not carry the tip body: give the bodies of one arm"
         )
     found = {}
-    for name, joint in hinges_of(model).items():
+    for name, joint in joints_of(model).items():
         body = int(model.jnt_bodyid[joint])
         if first in upwards(model, body)[1:] and (last is None or body in last):
             found[name] = joint
     if not found:
-        raise BadInput(f"--base {base or 'world'} --tip {tip or 'any'}: there is no hinge between these bodies")
+        raise BadInput(f"--base {base or 'world'} --tip {tip or 'any'}: there is no joint between these bodies")
     return found
 
 
-def arm_hinges(model: Any, hinges: dict[str, int], label: str) -> dict[str, int]:
-    """The longest chain of some hinges, without coupled joints and those of a hand at its end.
+def longest_chain(model: Any, joints: dict[str, int], label: str) -> dict[str, int]:
+    """The longest chain of some joints, without coupled joints and those of a hand at its end.
 
     Raises BadInput for several chains of that length, as of a model with two arms.
     """
     coupled = coupled_joints(model)
     ways: list[list[str]] = []
-    for tip in hinges.values():
+    for tip in joints.values():
         carriers = set(upwards(model, int(model.jnt_bodyid[tip])))
-        way = [name for name, joint in hinges.items() if int(model.jnt_bodyid[joint]) in carriers]
+        way = [name for name, joint in joints.items() if int(model.jnt_bodyid[joint]) in carriers]
         while way and (way[-1] in coupled or HAND.search(way[-1])):
             way.pop()
         if way not in ways:
@@ -149,11 +168,34 @@ def arm_hinges(model: Any, hinges: dict[str, int], label: str) -> dict[str, int]
     longest = max(map(len, ways), default=0)
     arms = [way for way in ways if len(way) == longest]
     if longest and len(arms) > 1:
-        tips = ", ".join(model.body(int(model.jnt_bodyid[hinges[way[-1]]])).name for way in arms)
+        tips = ", ".join(model.body(int(model.jnt_bodyid[joints[way[-1]]])).name for way in arms)
         raise BadInput(
             f"{label}: has {len(arms)} arms of {longest} joints: choose an arm by its last body with --tip: {tips}"
         )
-    return {name: hinges[name] for way in arms for name in way}
+    return {name: joints[name] for way in arms for name in way}
+
+
+def recorded_joints(
+    model: Any, known: dict[str, int], names: tuple[str, ...], count: int | None, label: str
+) -> list[int]:
+    """Those of the known joints that a recording has: by its names, else in order, and then slides only if the hinges
+    alone are not as many. Raises BadInput if their number does not fit."""
+    if names and all(name in known for name in names):
+        return [known[name] for name in names]
+    hinges = {name: joint for name, joint in known.items() if not is_slide(model, joint)}
+    if count is None:
+        return list(hinges.values())
+    for some in (hinges, known):
+        chain = some if len(some) == count else longest_chain(model, some, label)
+        if len(chain) == count:
+            return list(chain.values())
+    slides = [name for name in known if name not in hinges]
+    text = f"{len(hinges)} hinge joints ({', '.join(hinges)})"
+    text += f" and {len(slides)} prismatic joints ({', '.join(slides)})" if slides else ""
+    raise BadInput(
+        f"{label}: has {text}, but the recording has {count}: give the model of the recorded arm, or a recording with "
+        "the joint names of the model"
+    )
 
 
 def _body(model: Any, name: str, option: str) -> int:
@@ -190,30 +232,17 @@ def load_model(
 ) -> SimModel:
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
-    `names` are the recording's joint names if it has any; `count` is its number of joints; `known` are the hinges that
-    may be the arm's, with their ids (`hinges_between`), by default all. Joints are matched by name if the model has all
+    `names` are the recording's joint names if it has any; `count` is its number of joints; `known` are the joints that
+    may be the arm's, with their ids (`joints_between`), by default all. Joints are matched by name if the model has all
     of them, else in order; if there are too many, those of a hand and coupled ones are locked. `path` is the file of a
     compiled model. Raises BadInput if the model cannot be read or does not fit.
     """
     path = Path(source) if isinstance(source, str | Path) else path
     model = load_compiled(source)
-    known = hinges_of(model) if known is None else dict(known)
-    hinges = list(known.values())
     label = str(path or "the model")
-    if names and all(name in known for name in names):
-        joints = [known[name] for name in names]
-    else:
-        if count is not None and count != len(hinges):
-            hinges = list(arm_hinges(model, known, label).values())
-        if count is not None and count != len(hinges):
-            raise BadInput(
-                f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), but the recording "
-                f"has {count}: give the model of the recorded arm, or a recording with the joint names of "
-                "the model"
-            )
-        joints = hinges
+    joints = recorded_joints(model, joints_of(model) if known is None else dict(known), names, count, label)
     if not joints:
-        raise BadInput(f"{label}: the model has no hinge joint: expected the arm as a chain of hinges")
+        raise BadInput(f"{label}: the model has no hinge joint: expected the arm as a chain of joints")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
         order = ",".join(name for _, name in sorted(zip(joints, arm.names, strict=True)))
@@ -274,7 +303,7 @@ def urdf_behind(path: Path | None) -> Path | None:
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
-    """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
+    """The chain of the MuJoCo joints `joints` (hinges and slides, base to tip) of a compiled model.
 
     Other joints of the model are locked at qpos0; bodies on them belong to the link that carries them.
     """
@@ -299,6 +328,7 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
         rotation=np.array([up[0].T @ own[0] for up, own in zip(ups, frames, strict=True)]),
         offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
         axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
+        slides=np.array([is_slide(model, j) for j in joints]),
         zero=model.qpos0[adr].copy(),
         range=np.where(model.jnt_limited[list(joints)][:, None], model.jnt_range[list(joints)], (-np.inf, np.inf)),
         inertial=inertial,
@@ -360,7 +390,7 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
                 raise BadInput(
                     f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
                     f"N·m, but the torque of its rigid chain is {ours[worst]:.6g} N·m: expected a plain chain of "
-                    "hinges (no springs between joints, fluid forces or joint equalities)"
+                    "joints (no springs between joints, fluid forces or joint equalities)"
                 )
     finally:
         model.opt.disableflags = flags

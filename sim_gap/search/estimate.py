@@ -206,8 +206,10 @@ class EffectEstimate:
         jacobian = np.stack(slopes, axis=1)
         spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
         half = spread * self._quantile
+        of_joint = not term.effect.startswith(("link.", "base."))
+        arm = self.store.data.signals[0].arm
         return {
-            name: Value(float(c), float(c - h), float(c + h), unit)
+            name: Value(float(c), float(c - h), float(c + h), arm.unit_at(term.place, unit) if of_joint else unit)
             for (name, unit), c, h in zip(term.form.reported, centre, half, strict=True)
         }
 

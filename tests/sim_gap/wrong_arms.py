@@ -1,5 +1,6 @@
 """Recordings of an arm that is wrong in a known way, made by MuJoCo's inverse dynamics on smooth random motion."""
 
+from copy import copy
 from dataclasses import dataclass, field
 
 import mujoco
@@ -114,7 +115,7 @@ def record_along(
 
 
 def _truth(nominal: mujoco.MjModel, wrong: Wrong) -> mujoco.MjModel:
-    real = mujoco.MjModel.from_xml_string(THREE) if nominal.nv == 3 else nominal
+    real = copy(nominal)
     for link, shift in wrong.moved.items():
         real.body_ipos[link + 1] += shift
     if wrong.payload:

@@ -262,7 +262,8 @@ def interval(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, n
     for limit in spread.limits:
         if (limit.joint, limit.name) == (joint, name):
             value = float(fit.point[name][joint])
-            return Value(value, limit.least, max(limit.most, value), PARAMETERS[name].unit)
+            unit = search.data.plant.sim.arm.unit_at(joint, PARAMETERS[name].unit)
+            return Value(value, limit.least, max(limit.most, value), unit)
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
     half = min(half, ANYTHING) if name in LOGARITHMIC else half
@@ -270,8 +271,9 @@ def interval(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, n
     problem, about = layout.problem(), layout.theta
     points = [fit.point, *(layout.at(problem.within(about + step)) for step in (-half, half))]
     value, *ends = (float(point[name][max(joint, 0)]) for point in points)
-    unit = PARAMETERS[name].unit if joint >= 0 else UNIT[name.partition(".")[2]]
-    return Value(value, min(ends), max(ends), unit)
+    if joint < 0:
+        return Value(value, min(ends), max(ends), UNIT[name.partition(".")[2]])
+    return Value(value, min(ends), max(ends), search.data.plant.sim.arm.unit_at(joint, PARAMETERS[name].unit))
 
 
 def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> Value:

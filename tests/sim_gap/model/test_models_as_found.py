@@ -10,7 +10,7 @@ import yaml
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
-from sim_gap.model.load import ends_of, hinges_between, load_compiled, load_model
+from sim_gap.model.load import ends_of, joints_between, load_compiled, load_model
 
 ARM4 = Path(__file__).parents[2] / "models" / "arm4.urdf"
 """Four joints, a gripper with a mimic joint, meshes that are not there."""
@@ -79,11 +79,11 @@ def test_which_of_two_arms_is_recorded_is_not_guessed(two_arms):
 
 def test_an_arm_is_chosen_by_its_ends(two_arms):
     model = load_compiled(two_arms)
-    between = hinges_between(model, "torso", "right_lower")
+    between = joints_between(model, "torso", "right_lower")
     assert list(between) == ["right_shoulder", "right_elbow"]
-    assert list(hinges_between(model, None, "left_lower")) == ["waist", "left_shoulder", "left_elbow"]
+    assert list(joints_between(model, None, "left_lower")) == ["lift", "waist", "left_shoulder", "left_elbow"]
     right, left = (
-        load_model(two_arms, (), 2, hinges_between(model, "torso", tip)) for tip in ("right_lower", "left_lower")
+        load_model(two_arms, (), 2, joints_between(model, "torso", tip)) for tip in ("right_lower", "left_lower")
     )
     assert right.arm.names == ("right_shoulder", "right_elbow")
     assert not np.allclose(torque(right), torque(left))
@@ -94,12 +94,12 @@ def test_an_arm_is_chosen_by_its_ends(two_arms):
     [
         ("chest", None, "--base chest: the model has no such body; expected one of lift, torso, left_upper"),
         ("left_upper", "right_lower", "the base body does not carry the tip body"),
-        ("right_lower", None, "no hinge between these bodies"),
+        ("right_lower", None, "no joint between these bodies"),
     ],
 )
 def test_ends_that_are_none_are_one_line(two_arms, base, tip, says):
     with pytest.raises(BadInput, match=says):
-        hinges_between(load_compiled(two_arms), base, tip)
+        joints_between(load_compiled(two_arms), base, tip)
 
 
 def test_the_ends_of_an_arm_file_count(two_arms, tmp_path):

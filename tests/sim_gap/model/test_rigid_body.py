@@ -11,14 +11,15 @@ from gcomp.arm.rigid_body import RigidArm, torque_slopes
 from sim_gap.model.load import load_model, rigid_arm
 
 
-def random_arm(n: int, seed: int) -> str:
+def random_arm(n: int, seed: int, slides: tuple[int, ...] = ()) -> str:
     """MJCF of a chain with random frames, axes, offset joints, inertias and a fixed body on every other link."""
     random = np.random.default_rng(seed)
     xml, close = "", ""
     for i in range(n):
         numbers = lambda k, low=-0.3, high=0.3: " ".join(f"{x:.6f}" for x in random.uniform(low, high, k))  # noqa: E731
         xml += f'<body name="b{i}" pos="{numbers(3)}" euler="{numbers(3, -2, 2)}">'
-        xml += f'<joint name="j{i}" axis="{numbers(3, 0.2, 1)}" pos="{numbers(3)}" ref="{numbers(1)}"/>'
+        kind = "slide" if i in slides else "hinge"
+        xml += f'<joint name="j{i}" type="{kind}" axis="{numbers(3, 0.2, 1)}" pos="{numbers(3)}" ref="{numbers(1)}"/>'
         xml += f'<inertial pos="{numbers(3)}" mass="{random.uniform(0.3, 4):.4f}" '
         xml += f'diaginertia="0.03 0.025 {random.uniform(0.01, 0.05):.4f}" euler="{numbers(3, -2, 2)}"/>'
         if i % 2:
@@ -42,17 +43,20 @@ def states(n: int, rows: int = 20, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-2, 2, (3, rows, n))
 
 
-@pytest.mark.parametrize("n", [2, 3, 5, 7])
-def test_torque_is_that_of_mujoco_on_random_arms(n: int):
-    model = mujoco.MjModel.from_xml_string(random_arm(n, seed=n))
+CHAINS = [(2, ()), (3, ()), (5, ()), (7, ()), (1, (0,)), (4, (2,)), (6, (0, 3, 5)), (3, (0, 1, 2))]
+
+
+@pytest.mark.parametrize(("n", "slides"), CHAINS)
+def test_torque_is_that_of_mujoco_on_random_arms(n: int, slides: tuple[int, ...]):
+    model = mujoco.MjModel.from_xml_string(random_arm(n, n, slides))
     arm = rigid_arm(model, range(n))
     q, v, a = states(n)
     np.testing.assert_allclose(arm.torque(q, v, a), inverse(model, q, v, a), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [3, 6])
-def test_regressor_times_parameters_is_the_torque(n: int):
-    arm = rigid_arm(mujoco.MjModel.from_xml_string(random_arm(n, seed=10 + n)), range(n))
+@pytest.mark.parametrize(("n", "slides"), CHAINS)
+def test_regressor_times_parameters_is_the_torque(n: int, slides: tuple[int, ...]):
+    arm = rigid_arm(mujoco.MjModel.from_xml_string(random_arm(n, 10 + n, slides)), range(n))
     q, v, a = states(n)
     motion = arm.motion(q, v, a)
     product = sum(arm.link_regressor(motion, link) @ arm.inertial[link] for link in range(n))
@@ -73,12 +77,13 @@ def test_regressor_columns_are_finite_differences_of_mujocos_torque():
         np.testing.assert_allclose(slope, moved[..., 1], atol=1e-4)
 
 
-def test_torque_and_its_slopes_are_those_of_pinocchio(tmp_path):
+@pytest.mark.parametrize("text", [THREE, THREE.replace('name="joint_2"', 'name="joint_2" type="slide"')])
+def test_torque_and_its_slopes_are_those_of_pinocchio(tmp_path, text):
     pin = pytest.importorskip("pinocchio")
     path = tmp_path / "arm.xml"
-    path.write_text(THREE)
+    path.write_text(text)
     model = pin.buildModelFromMJCF(str(path))
-    arm, (q, v, a) = load_model(path).arm, states(3)
+    arm, (q, v, a) = load_model(path, (), 3).arm, states(3)
     rows, data = list(zip(q, v, a, strict=True)), model.createData()
     expected = [pin.rnea(model, model.createData(), *row) for row in rows]
     np.testing.assert_allclose(arm.torque(q, v, a), expected, atol=1e-9)
@@ -103,7 +108,7 @@ def test_joint_terms_of_the_model_count_on_the_motor_side_and_springs_beside_it(
 def test_a_model_that_is_not_a_plain_chain_is_refused(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(THREE.replace("</mujoco>", '<option density="50" viscosity="9"/></mujoco>'))
-    with pytest.raises(BadInput, match=r"joint_\d.*expected a plain chain of hinges"):
+    with pytest.raises(BadInput, match=r"joint_\d.*expected a plain chain of joints"):
         load_model(path)
 
 
