@@ -17,11 +17,11 @@ from armlink.content.file_content import MOST_TEXT, parse_yaml, read_whole
 from armlink.contributed import contributions, load_contribution
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, suggest_key
+from armlink.model_file import MODEL_SUFFIXES
 from armlink.names import JointName, Name
 
 SIMULATED = "armlink_sim"
 """Interface of a simulated arm in this process; its channel is an arm file."""
-MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 LONGEST_DEADLINE = 10.0
 """Of a link [s]."""

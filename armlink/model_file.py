@@ -14,6 +14,7 @@ from armlink.content.memory_budget import memory_budget
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 log = logging.getLogger(__name__)
 READABLE_MESHES = (".stl", ".obj", ".msh")
 STL_HEADER, STL_FACE = 84, 50
@@ -98,11 +99,18 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
     """
     import mujoco
 
+    if path.suffix.lower() not in MODEL_SUFFIXES:
+        how = f": expand it first: xacro {path} > {path.stem}" if path.suffix.lower() == ".xacro" else ""
+        raise BadInput(f"{path}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}){how}")
     warned: list[str] = []
     mujoco.set_mju_user_warning(warned.append)
     try:
         with model_budget(path):
-            spec = mujoco.MjSpec.from_file(str(path))
+            if path.suffix.lower() == ".mjcf":  # a suffix that MuJoCo does not know
+                spec = mujoco.MjSpec.from_string(path.read_text(encoding="utf-8"))
+                spec.modelfiledir = str(path.resolve().parent)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
         raise BadInput(f"{path}: MuJoCo cannot read this model: {one_line(error)}") from None
     finally:

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.arm_file import MODEL_SUFFIXES, ArmFile, Tool, load_arm
+from armlink.arm_file import ArmFile, Tool, load_arm
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
+from armlink.model_file import MODEL_SUFFIXES
 from gcomp.arm.arm import Arm, bar_rotations
 from gcomp.arm.load import ModelArm, PlacedChain, place_chain
 from gcomp.arm.mass_moments import payload_columns

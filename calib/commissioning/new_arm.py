@@ -11,11 +11,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
+from armlink.arm_file import ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole, writing
 from armlink.content.file_content import parse_yaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import ArmlinkError, BadInput
+from armlink.model_file import MODEL_SUFFIXES
 from calib.arm.kinematics import model_arm, model_chain
 from calib.commissioning.chain import Chain, ModelJoint, find_chains, model_joints
 from calib.commissioning.draft import Draft, arm_text, draft_of_model

@@ -11,7 +11,7 @@ import numpy as np
 from rich.text import Text
 
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
-from armlink.arm_file import MODEL_SUFFIXES, ArmFile
+from armlink.arm_file import ArmFile
 from armlink.commands.output import write_json
 from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
 from armlink.content.atomic_file import writing
@@ -19,6 +19,7 @@ from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
+from armlink.model_file import MODEL_SUFFIXES
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section

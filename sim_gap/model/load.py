@@ -180,11 +180,13 @@ def recorded_joints(
 ) -> list[int]:
     """Those of the known joints that a recording has: by its names, else in order, and then slides only if the hinges
     alone are not as many. Raises BadInput if their number does not fit."""
+    if not known:
+        raise BadInput(f"{label}: the model has no joint: expected the arm as a chain of joints")
     if names and all(name in known for name in names):
         return [known[name] for name in names]
     hinges = {name: joint for name, joint in known.items() if not is_slide(model, joint)}
     if count is None:
-        return list(hinges.values())
+        return list((hinges or known).values())
     for some in (hinges, known):
         chain = some if len(some) == count else longest_chain(model, some, label)
         if len(chain) == count:
@@ -241,8 +243,6 @@ def load_model(
     model = load_compiled(source)
     label = str(path or "the model")
     joints = recorded_joints(model, joints_of(model) if known is None else dict(known), names, count, label)
-    if not joints:
-        raise BadInput(f"{label}: the model has no hinge joint: expected the arm as a chain of joints")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
         order = ",".join(name for _, name in sorted(zip(joints, arm.names, strict=True)))

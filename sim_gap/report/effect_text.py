@@ -4,8 +4,6 @@ from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 
 WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
-NAMED = 4
-"""Number of effects that fit as well which a text names; the JSON answer has all."""
 CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd": "commanded torque"}
 """Torque channels of a recording, for people."""
 
@@ -45,10 +43,10 @@ def sentence(answer: Diagnosis) -> str:
 
 
 def rivals_of(cause: Cause, between: str) -> str:
-    """The effects that fit as well, the first of them where they are many."""
+    """The effects that fit as well; of many the first four, since the JSON answer has all."""
     names = cause.confounded_with
-    if len(names) > NAMED + 1:
-        names = (*names[:NAMED], f"{len(names) - NAMED} others")
+    if len(names) > 5:
+        names = (*names[:4], f"{len(names) - 4} others")
     return between.join(names)
 
 

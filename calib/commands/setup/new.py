@@ -99,10 +99,10 @@ def new(
 
     Example: armlink new arm.urdf --out arm.yaml
     """
-    from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
+    from armlink.arm_file import bundled_arms, load_arm
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.loop.open import first_check
-    from armlink.model_file import expand_xacro
+    from armlink.model_file import MODEL_SUFFIXES, expand_xacro
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.drive_match import drives_have_ids
     from calib.commissioning.new_arm import new_arm

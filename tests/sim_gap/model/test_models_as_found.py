@@ -48,6 +48,43 @@ def test_a_mass_that_comes_from_an_absent_mesh_is_one_line(tmp_path):
         load_model(model)
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("arm.sdf", r"arm.sdf: expected a URDF or MJCF model \(.xml, .mjcf, .urdf\)$"),
+        ("arm.urdf.xacro", r"expand it first: xacro .*arm.urdf.xacro > arm.urdf$"),
+    ],
+)
+def test_a_file_of_another_kind_is_one_line(tmp_path, name, says):
+    (tmp_path / name).write_text("<sdf/>")
+    with pytest.raises(BadInput, match=says):
+        load_model(tmp_path / name)
+
+
+def test_a_model_without_joints_says_so(tmp_path):
+    (tmp_path / "arm.urdf").write_text('<robot name="a"><link name="base"/></robot>')
+    with pytest.raises(BadInput, match="the model has no joint"):
+        load_model(tmp_path / "arm.urdf", (), 3)
+
+
+def test_a_file_named_mjcf_is_read_with_its_meshes(tmp_path):
+    box = [[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)]
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/box.obj").write_text(
+        "".join(f"v {x} {y} {z}\n" for x, y, z in box) + "f 1 2 3\nf 2 4 3\nf 5 7 6\nf 6 7 8\nf 1 5 2\nf 2 5 6\n"
+        "f 3 4 7\nf 4 8 7\nf 1 3 5\nf 3 7 5\nf 2 6 4\nf 4 6 8\n"
+    )  # fmt: skip
+    text = (
+        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="m" file="box.obj"/></asset><worldbody>'
+        '<body name="link"><joint name="j"/><geom type="mesh" mesh="m" density="1000"/></body></worldbody></mujoco>'
+    )
+    masses = []
+    for name in ("arm.xml", "arm.mjcf"):
+        (tmp_path / name).write_text(text)
+        masses.append(load_model(tmp_path / name).arm.inertial[0, 0])
+    assert masses[0] == masses[1] == pytest.approx(8.0)
+
+
 def arm(side: str, reach: float) -> str:
     """Two hinges on the torso, the second link `reach` long [m]."""
     return (
