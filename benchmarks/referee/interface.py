@@ -119,9 +119,8 @@ def check(answer: Answer, case: Case, words: Mapping[str, Mapping[str, str]], ef
         what = f"parameter {p.name!r} of joint {p.joint!r}" if p.joint else f"parameter {p.name!r}"
         if p.joint and p.joint not in case.joints:
             raise ValueError(f"{what}: the model has no such joint")
-        stated = [x for x in (p.low, p.value, p.high, p.nominal) if x is not None]
-        if not all(map(math.isfinite, stated)):
-            raise ValueError(f"{what}: {p.value}, {p.low} to {p.high}, nominal {p.nominal} are not all finite numbers")
+        if not all(math.isfinite(x) for x in (p.value, p.nominal) if x is not None):
+            raise ValueError(f"{what}: its value {p.value} or its nominal value {p.nominal} is not a finite number")
         if (p.low is None) != (p.high is None) or (p.low is not None and not p.low <= p.value <= p.high):
             raise ValueError(f"{what}: {p.value} is not between {p.low} and {p.high}")
 

@@ -23,7 +23,7 @@ WRONG_DECISIONS = 0.05
 """Probability that any of the differences that a score decides is due to the draw of the cases."""
 DRAWS, WILSON_Z = 2000, 1.959964
 TINY = 1e-4
-"""Relative errors and widths below this count as this."""
+"""Relative errors and widths below this count as this; widths above its inverse, as those without an end, as that."""
 TABLES = json.loads(Path(__file__).with_name("families.json").read_text(encoding="utf-8"))
 FAMILY = {effect: family for family, effects in TABLES["families"].items() for effect in effects}
 Json = Mapping[str, Any]
@@ -132,7 +132,7 @@ def _parameter_scores(parameters: Sequence[Parameter], words: str, truth: Iterab
         if p.low is not None and p.high is not None:
             inside.append(p.low <= row["value"] <= p.high)
             if row["drawn"] and change > 0.0:
-                widths.append(math.log(max((p.high - p.low) / change, TINY)))
+                widths.append(math.log(min(max((p.high - p.low) / change, TINY), 1.0 / TINY)))
     return {
         "error": math.exp(np.mean(errors)) if errors else None,
         "width": math.exp(np.mean(widths)) if widths else None,

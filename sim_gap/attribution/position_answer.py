@@ -62,7 +62,7 @@ def diagnose_positions(
     taken = [
         (c, stage)
         for c, stage in zip(made, found.stages, strict=True)
-        if _lowers(found, stage) and _differs(found, stage)
+        if stage.worth > PRICE and _lowers(found, stage) and _differs(found, stage)
     ]
     causes = [c for c, _ in taken]
     minor = [c for c in made if c not in causes]

@@ -297,8 +297,10 @@ class Stage:
     """(J,) [rad]."""
     share: Array
     """Fall of the RMS in its place or as the last of all, whichever is more, as a share of it, (J,)."""
+    worth: float
+    """Fall of the held-out cost of training rows by it, all else fitted again without it."""
     evidence: float
-    """Fall of the held-out cost of training rows that nothing else would have brought."""
+    """What of it nothing else would have brought."""
     rivals: tuple[str, ...]
     """Effects that would do as well."""
 
@@ -322,8 +324,9 @@ def stages(about: About, heldout: Windows, matters: Array) -> list[Stage]:
     for group, before, after in zip(order, courses[:-1], courses[1:], strict=True):
         falls = [1.0 - np.hypot(b, floor) / np.hypot(a, floor) for a, b in ((before, after), (alone[group], final))]
         share = np.maximum(*falls)
-        loss, rivals = _rivals(about, group)
-        out.append(Stage(group, before, after, share, loss, rivals if (share > LEAST_SHRINK).any() else ()))
+        worth, evidence, rivals = _rivals(about, group)
+        shown = worth > PRICE and (share > LEAST_SHRINK).any()
+        out.append(Stage(group, before, after, share, worth, evidence, rivals if shown else ()))
     return out
 
 
@@ -331,8 +334,9 @@ ALWAYS = {"controller.dead_zone": ("transmission.backlash",)}
 """Effects that positions alone never separate."""
 
 
-def _rivals(about: About, group: Group) -> tuple[float, tuple[str, ...]]:
-    """Loss of the held-out cost with the best other effect in a group's place, and those that lose next to nothing."""
+def _rivals(about: About, group: Group) -> tuple[float, float, tuple[str, ...]]:
+    """Loss of the held-out cost without a group, and with the best other effect in its place; those that lose next to
+    nothing."""
     effect, joints = group
     terms, every = about.terms, about.effects
     chosen = [part for each in groups_of(about.fit, about.search) for part in parts_of(each) if part in every]
@@ -358,7 +362,7 @@ def _rivals(about: About, group: Group) -> tuple[float, tuple[str, ...]]:
             least = min(least, left)
             if left < max(PRICE, AS_WELL * whole):
                 close.append(other)
-    return max(least, 0.0), tuple(dict.fromkeys(close))
+    return whole, max(least, 0.0), tuple(dict.fromkeys(close))
 
 
 def _scale_rivals(about: About, chosen: Sequence[Group]) -> tuple[str, ...]:

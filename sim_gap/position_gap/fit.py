@@ -176,6 +176,8 @@ class Layout:
             return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
 
         weight = data.weight.transpose(1, 0, 2).reshape(shape) * min(data.judged_s / INDEPENDENT_S, 1.0)
+        # where a joint rests is what friction left of its way there: that tells nothing of links, gravity or gains
+        weight[sorted(self.search.resting)] = 0.0
         block = np.broadcast_to(np.arange(data.count), (len(data.measured), data.count)).ravel().astype(np.intp)
         fine, coarse = (partial(predicted, each) for each in (data, replace(data, plant=data.plant.coarser)))
         return EstimationProblem(parameters, fine, weight, block, self.search.floor, cheaper=coarse)

@@ -15,6 +15,7 @@ from referee import contest, draw, mujoco_plant, page, rounds, score, seal  # no
 from referee.interface import Answer, Cause, Parameter, answer_from_json  # noqa: E402
 
 from armlink.effect_catalogue import CATALOGUE  # noqa: E402
+from sim_gap.position_gap.parameters import EFFECTS  # noqa: E402
 
 PAGE = (ROOT / "docs/appendix/referee.md").read_text(encoding="utf-8")
 FIRST_RIGHT, ERROR, SECONDS = (
@@ -200,7 +201,7 @@ def test_nobody_reads_or_changes_what_is_sealed(tmp_path):
 
 
 def test_every_effect_has_a_family():
-    assert CATALOGUE.keys() <= score.FAMILY.keys()
+    assert {*CATALOGUE, *EFFECTS} <= score.FAMILY.keys()
 
 
 def test_adapters_are_short_and_on_the_page():
@@ -267,7 +268,7 @@ FRICTION = ("frictionloss", "joint_1")
         (Answer("mujoco", [Cause("damping", ("joint_1",), math.nan)]), "confidence nan"),
         (Answer("mujoco", [Cause("damping", ("elbow",), 0.9)]), "the model has no joint 'elbow'"),
         (Answer("mujoco", None, [Parameter("damping", "elbow", 0.1)]), "of joint 'elbow': the model has no such joint"),
-        (Answer("mujoco", None, [Parameter(*FRICTION, math.nan)]), "are not all finite numbers"),
+        (Answer("mujoco", None, [Parameter(*FRICTION, math.nan)]), "is not a finite number"),
         (Answer("mujoco", None, [Parameter(*FRICTION, 0.1, 0.2, 0.0)]), "0.1 is not between 0.2 and 0.0"),
         (Answer("mujoco", None, None, "no model"), "model: XML parse error"),
         (Answer("mujoco", None, None, "<mujoco/>"), "model: it lacks the joint joint_1"),
@@ -278,7 +279,7 @@ def test_an_answer_that_cannot_be_judged_is_a_failure_with_its_reason(tmp_path, 
     (tmp_path / "case.json").write_text(json.dumps(told), encoding="utf-8")
     with pytest.raises(ValueError, match=said):
         contest.judgeable(answer, tmp_path)
-    good = Parameter(*FRICTION, 0.1, 0.0, 0.2, 0.0)
+    good = Parameter(*FRICTION, 0.1, 0.0, math.inf, 0.0)
     contest.judgeable(Answer("mujoco", [Cause("damping", ("joint_1",), 0.9)], [good]), tmp_path)
 
 
