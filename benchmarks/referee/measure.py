@@ -1,7 +1,7 @@
 """How far a model is from a recording that no tool has seen: the same measures for every tool, on its MJCF alone.
 
-With torques: *residual*, the measured torque minus inverse dynamics, friction and damping of the model, as a share of
-the measured torque; *roll-out*, the position after windows that start from the measured state and are driven by the
+With torques: *residual*, the measured torque minus MuJoCo's inverse dynamics of the model with its friction, as a share
+of the measured torque; *roll-out*, the position after windows that start from the measured state and are driven by the
 measured torque. Without: *residual*, the position within windows under the recorded commands; *roll-out*, the whole
 recording running free. Each is one number over all joints.
 """
@@ -19,7 +19,7 @@ BAND_HZ = 6.0
 STATE_HZ = 15.0
 """Low pass of positions before they are differentiated (sim_gap/blind/cases.py)."""
 LEAST_SPEED = 0.02
-"""Speed below which friction is not determined [rad/s] (sim_gap/blind/scene.py)."""
+"""Speed below which friction is not determined, so that a row does not count [rad/s] (sim_gap/blind/scene.py)."""
 TORQUE_WINDOW_S, POSITION_WINDOW_S = 0.25, 1.0
 """Length of a window [s]: under a recorded torque any arm strays with time."""
 SETTLING_S = 1.0
@@ -96,7 +96,7 @@ def actuated(model: Any, joints: tuple[str, ...], kind: str) -> tuple[list[int],
 
 def _residual(model: Any, at: Any, dof: Any, seen: Even) -> float:
     """RMS of the torque that the model lacks, as a share of the measured torque's RMS, over all joints."""
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    _let_friction_alone_constrain(model)
     data, rows = mujoco.MjData(model), np.arange(0, len(seen.q), 2)
     nominal = np.empty((len(rows), len(dof)))
     for k, row in enumerate(rows):
@@ -104,7 +104,6 @@ def _residual(model: Any, at: Any, dof: Any, seen: Even) -> float:
         mujoco.mj_inverse(model, data)
         nominal[k] = data.qfrc_inverse[dof]
     speed = seen.v[rows]
-    nominal += model.dof_frictionloss[dof] * np.tanh(speed / LEAST_SPEED)
     low = butter(4, BAND_HZ, fs=0.5 / STEP_S, output="sos")
     rest, torque = (sosfiltfilt(low, x, axis=0) for x in (seen.torque[rows] - nominal, seen.torque[rows]))
     ends = round(0.5 * SETTLING_S / STEP_S)
@@ -117,11 +116,16 @@ def _residual(model: Any, at: Any, dof: Any, seen: Even) -> float:
     return float(np.sqrt(np.mean(shares)))
 
 
-def _driven_by_torque(model: Any, at: Any, dof: Any, seen: Even) -> float:
-    """RMS over windows and joints of the position error under the measured torque [rad]."""
+def _let_friction_alone_constrain(model: Any) -> None:
+    """Without actuators, limits and contacts; friction is MuJoCo's own, which the solver holds as a constraint."""
     off = mujoco.mjtDisableBit
     model.opt.disableflags &= ~int(off.mjDSBL_CONSTRAINT)
     model.opt.disableflags |= int(off.mjDSBL_ACTUATION | off.mjDSBL_LIMIT | off.mjDSBL_CONTACT)
+
+
+def _driven_by_torque(model: Any, at: Any, dof: Any, seen: Even) -> float:
+    """RMS over windows and joints of the position error under the measured torque [rad]."""
+    _let_friction_alone_constrain(model)
     model.opt.timestep = STEP_S
     length, ends, squares = round(TORQUE_WINDOW_S / STEP_S), round(SETTLING_S / STEP_S), []
     data = mujoco.MjData(model)

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
-from referee import contest, draw, mujoco_plant, page, rounds, score, seal  # noqa: E402
+from referee import contest, draw, interface, mjcf, mujoco_plant, page, rounds, score, seal  # noqa: E402
 from referee.interface import Answer, Cause, Parameter, answer_from_json  # noqa: E402
 
 from armlink.effect_catalogue import CATALOGUE  # noqa: E402
@@ -238,6 +238,12 @@ def test_a_round_with_the_adapter_of_the_page(tmp_path, monkeypatch):
     by_hand = abs(mine.value - true["value"]) / abs(true["value"] - true["nominal"])
     assert scores["error"] == pytest.approx(by_hand)
     assert scores["residual"] < 1.0
+    of_case = interface.load_case(public)
+    quantity = score.TABLES["vocabularies"]["mujoco"]
+    (name,) = (word for word, target in quantity.items() if target == f"{true['effect']}:{true['quantity']}")
+    truth = Answer("mujoco", None, None, mjcf.corrected(of_case, {(name, true["joint"]): true["value"]}))
+    of_truth = rounds.score_row({**made, "answer": truth.to_json()}, opened, nominal)["scores"]
+    assert of_truth["residual"] < 1.01 * scores["residual"], "no model is better than the true one"
 
 
 def test_a_tool_that_is_not_there_or_never_ends_is_said_so(tmp_path, monkeypatch):
