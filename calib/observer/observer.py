@@ -69,6 +69,10 @@ class Estimate:
     accepted: Array
     """Rows that went into each."""
 
+    def as_json(self) -> dict[str, list[float]]:
+        """All but `accepted`, as lists."""
+        return {name: getattr(self, name).tolist() for name in ("gain", "gain_std", "offset", "offset_std")}
+
 
 class Observer:
     """`handle(sample)` → events; `estimate()`; `install(finding)` after a new calibration was written."""
