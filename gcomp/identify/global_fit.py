@@ -24,7 +24,7 @@ DOUBT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """What readings tell of the parameters, and how exactly."""
+    """Which parameters the readings determine, and how exactly."""
 
     std: Parameters
     """Standard deviations; inf if not identifiable, 0 if known."""
