@@ -10,7 +10,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.design.selection import select, stop_combinations, sufficient_levers, sweep_jacobian
 from gcomp.gravity.torque import gravity_levers, torque_covariance
-from gcomp.identify.global_fit import Prediction, predict_covariance
+from gcomp.identify.global_fit import Precision, predict_covariance
 from gcomp.identify.parameters import Parameters, free_mask, natural_units
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings
@@ -48,7 +48,7 @@ def compare(
     rng = np.random.default_rng(0)
     checked = rng.uniform(arm.lower, arm.upper, (400, arm.n))
 
-    def error(prediction: Prediction) -> np.ndarray:
+    def error(prediction: Precision) -> np.ndarray:
         at = [i for i, name in enumerate(prediction.names) if name.startswith("mass_moment")]
         covariance = torque_covariance(arm, prediction.covariance[np.ix_(at, at)], checked)
         return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))

@@ -264,6 +264,10 @@ class Link(Calibrations):
         for name, (group, number) in zip(self.names, by_joint(self.groups), strict=True):
             if group.drives.has_restarted(number):
                 raise BusFault(f"{name}: its drive has just restarted (boot-up message): repeat the command")
+        self.require_sound_bus()
+
+    def require_sound_bus(self) -> None:
+        """Raise BusFault where the bus itself has a fault, such as a second host."""
         fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)

@@ -8,7 +8,6 @@ import numpy as np
 
 from armlink.drives.orders import Order, Power
 from armlink.errors import BusFault
-from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import joint_ranges
 from armlink.link.joints.groups import by_joint
 from armlink.link.joints.values import JointValues
@@ -78,9 +77,7 @@ def judge_by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
     low, high = np.full(link.n, np.inf), np.full(link.n, -np.inf)
     while (now := link.clock.now()) < end:
         sample = link.commander.stand([Power.OFF] * link.n)
-        fault = bus_fault(link.names, link.commander.loop.watch, 0)
-        if fault:
-            raise BusFault(fault)
+        link.require_sound_bus()
         tracks.add(sample, [None] * link.n)
         low, high = np.fmin(low, sample.position), np.fmax(high, sample.position)
         if now - told >= TELL_SECONDS:

@@ -77,10 +77,7 @@ def observe(
         "rows": observer.rows,
         "events": told,
         "joints": list(described.names),
-        "gain": found.gain.tolist(),
-        "gain_std": found.gain_std.tolist(),
-        "offset": found.offset.tolist(),
-        "offset_std": found.offset_std.tolist(),
+        **found.as_json(),
     }
     write_json(json_file, answer)
     return int(bool(changes))

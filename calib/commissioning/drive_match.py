@@ -144,25 +144,24 @@ def arm_of_bus(
         raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate")
     if ask is None:
         matches = [Match(f"joint_{i}", drive, by_hand=False) for i, drive in enumerate(drives.found, start=1)]
-        stops = [_turn_about(each) for each in _standing(drives)]
+        stops = _turns(drives)
     else:
         matches, stops = _by_hand(drives, channel, ask)
     return _text(matches, stops, channel, bus, name), matches
 
 
-def _standing(drives: FoundDrives) -> list[float]:
-    """Where each drive stands [rad]; 0 where one does not tell."""
+def _turns(drives: FoundDrives) -> list[tuple[float, float]]:
+    """A turn about zero, or about where a drive stands beyond it, as one before a further gear does [rad].
+
+    A drive that does not tell counts as at zero.
+    """
     try:
         positions = drives.positions()
     except BusFault:
         positions = {}
-    return [positions.get(each.address, 0.0) for each in drives.found]
-
-
-def _turn_about(position: float) -> tuple[float, float]:
-    """A turn about zero, or about a position beyond it: that of a drive before a further gear [rad]."""
-    middle = 0.0 if abs(position) < math.pi else position
-    return middle - math.pi, middle + math.pi
+    standing = [positions.get(each.address, 0.0) for each in drives.found]
+    middles = [0.0 if abs(position) < math.pi else position for position in standing]
+    return [(middle - math.pi, middle + math.pi) for middle in middles]
 
 
 def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], list[tuple[float, float]]]:

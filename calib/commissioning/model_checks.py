@@ -19,14 +19,13 @@ from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.plan.collisions import check_plan
 from calib.plan.creep_plan import plan_creep, refuse_unbearable_creeps
 from calib.plan.planned_arm import PlannedArm
-from calib.plan.rough_gravity import HAND, GravityGuess, guess_of_file, guess_of_model, reach
+from calib.plan.rough_gravity import HAND, GravityGuess, guess_of_file, guess_of_model, known_torques, reach
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import DEAD_LEVER, plan_sweep, refuse_unbearable_mass
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm, joint_inertias
-from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
-from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_torque
+from gcomp.gravity.torque import gravity_levers, gravity_torque
 
 NO_MASS = 1e-9
 """Mass of all moving links that stands for none [kg]: the reader gives massless bodies a negligible one."""
@@ -89,10 +88,7 @@ def gain_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if not arm_file.has_geometry:
         return
     arm = gcomp_arm(arm_file)
-    (origin, by_point), regressor = payload_columns(arm), gravity_regressor(arm, _poses(arm)).reshape(-1, 2 * arm.n)
-    torque, shift = regressor @ origin, regressor @ by_point
-    left = torque - shift @ np.linalg.lstsq(shift, torque, rcond=None)[0]
-    if np.abs(left).max() < SAME_POINT * np.linalg.norm(arm.gravity):
+    if np.abs(known_torques(arm, _poses(arm))).max() < SAME_POINT * np.linalg.norm(arm.gravity):
         yield SetupFinding(
             "error",
             "the axes of all joints that gravity loads pass through one point, so a mass whose place is unknown cannot "

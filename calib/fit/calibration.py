@@ -98,6 +98,8 @@ class FittedCalibration(ABC):
     """(Joint, parameter) → why it has no value."""
     sources: dict[str, str]
     """Names and digests of the data sets."""
+    findings: tuple[FitFinding, ...] = ()
+    """Effects in the readings that the model does not have."""
 
     @abstractmethod
     def estimate(self, parameter: str) -> tuple[Array, Array]:
@@ -111,11 +113,6 @@ class FittedCalibration(ABC):
     @abstractmethod
     def residual_rms(self) -> Array:
         """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
-
-    @property
-    def findings(self) -> tuple[FitFinding, ...]:
-        """Effects in the readings that the model does not have."""
-        return ()
 
     @property
     def broken(self) -> dict[str, str]:

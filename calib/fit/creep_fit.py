@@ -59,17 +59,13 @@ class CreepFit(FittedCalibration):
     prior_std: Array
     ripple: Array
     """Periods in a turn of the ripple that each joint has, 0 for none (n,)."""
-    pushes: tuple[FitFinding, ...] = ()
+    findings: tuple[FitFinding, ...] = ()
     """Sweeps that were left out, and springs; the other values hold beside these."""
     sources: dict[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.arm.names
-
-    @property
-    def findings(self) -> tuple[FitFinding, ...]:
-        return self.pushes
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -120,7 +116,7 @@ class CreepFit(FittedCalibration):
         doubt = {family: self.prior_std[self.slices[family]] for family in ("offset", "zero")}
         offset, zero = (self.estimate(family)[1] / doubt[family] for family in ("offset", "zero"))
         for joint, name in enumerate(self.names):
-            pull = next((each for each in self.pushes if each.joint == name and each.kind == "spring"), None)
+            pull = next((each for each in self.findings if each.joint == name and each.kind == "spring"), None)
             if pull is not None:
                 reasons[name, "gain"] = pull.text.removeprefix(f"{name}: ")
             elif not self.found_gain[joint]:
@@ -184,7 +180,7 @@ def fit_creep(arm_file: ArmFile, data: Sequence[SweepData]) -> CreepFit:
     doubt = sweep_section(arm_file).motor_doubt
     fit = fit_rows(gcomp_arm(arm_file), rows, arm_file.require_link().rated_torques, doubt)
     contacts = tuple(contact_finding(each, stall) for each in data for stall in each.contacts)
-    return replace(fit, pushes=(*contacts, *fit.pushes), sources=digests(data))
+    return replace(fit, findings=(*contacts, *fit.findings), sources=digests(data))
 
 
 def fit_rows(arm: Arm, rows: SweepReadings, rated: Array, doubt: MotorDoubt | None = None) -> CreepFit:
@@ -201,7 +197,7 @@ def fit_rows(arm: Arm, rows: SweepReadings, rated: Array, doubt: MotorDoubt | No
     free = _fit(arm, rows, rated, loose, plain.solution.x, ripple=False)
     pulled = springs(arm.names, rows, *free.estimate("spring"), rated)
     fit = _fit(arm, rows, rated, loose, free.solution.x) if pulled else plain
-    return replace(fit, pushes=(*left_out, *pulled))
+    return replace(fit, findings=(*left_out, *pulled))
 
 
 def _fit(

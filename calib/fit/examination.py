@@ -26,7 +26,7 @@ from calib.records.records import Discrepancy
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
-from gcomp.identify.parameters import Parameters, Prior, parameter_names
+from gcomp.identify.parameters import Prior, parameter_names
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
@@ -142,7 +142,10 @@ def examine(
     """
     rows, findings = _without_plateaus(kinematics.names, rows)
     encoders = encoder_findings(kinematics.names, rows)
-    setting = _setting(kinematics, rows, rated, fit.complete)
+    counted, poses = rows.readings.counted, rows.readings.position
+    fields = tuple(PositionField.over(poses[counted[:, joint]], 1.0) for joint in range(kinematics.n))
+    lags = Lags.of(kinematics, rows, fit.complete, rated)
+    setting = Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())), lags)
     effects, sound = list[UnmodelledEffect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
@@ -172,13 +175,6 @@ def examine(
     final = encoders or findings  # a wrong position causes the others
     doubt = remaining_doubt(setting, rows, refined)
     return Goodness(refined, tuple(final), leave_out(refined, rows), doubt)
-
-
-def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Parameters) -> Setting:
-    counted, poses = rows.readings.counted, rows.readings.position
-    fields = tuple(PositionField.over(poses[counted[:, joint]], 1.0) for joint in range(kinematics.n))
-    lags = Lags.of(kinematics, rows, parameters, rated)
-    return Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())), lags)
 
 
 def _sized(effects: list[UnmodelledEffect], refined: Refined) -> Iterator[tuple[UnmodelledEffect, Array]]:

@@ -156,7 +156,7 @@ class SensorFit(FittedCalibration):
         return np.asarray(getattr(self.quantiles, parameter))
 
     @property
-    def findings(self) -> tuple[FitFinding, ...]:
+    def findings(self) -> tuple[FitFinding, ...]:  # type: ignore[override]
         return self.goodness.findings
 
     def discrepancy_of(self, joint: int) -> Discrepancy:

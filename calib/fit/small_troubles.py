@@ -63,14 +63,13 @@ class PositionField:
 
 
 def kernel(one: Array, other: Array, length: float) -> Array:
-    """Correlation (K, M) of a field of this length [rad] at poses (K, n) and (M, n) [rad]."""
-    return np.asarray(np.exp(-squared_distance(one, other) / (2 * length**2)))
+    """Correlation (K, M) of a field of this length [rad] at poses (K, n) and (M, n) [rad].
 
-
-def squared_distance(one: Array, other: Array) -> Array:
-    """Squared distance (K, M) of poses: Σ_l (2 sin(Δ_l/2))² = 2 Σ_l (1 − cos Δ_l), a turn of a joint being none."""
+    The squared distance of poses is Σ_l (2 sin(Δ_l/2))² = 2 Σ_l (1 − cos Δ_l), a turn of a joint being none.
+    """
     cos, sin = np.cos(one) @ np.cos(other).T, np.sin(one) @ np.sin(other).T
-    return np.asarray(np.maximum(2 * (one.shape[1] - cos - sin), 0.0))
+    square = np.maximum(2 * (one.shape[1] - cos - sin), 0.0)
+    return np.asarray(np.exp(-square / (2 * length**2)))
 
 
 TURNS = (0.1, 0.3, 0.8)

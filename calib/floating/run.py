@@ -58,18 +58,19 @@ class FloatControl:
         max_velocity: Array,
         period: float,
         config: FloatConfig | None = None,
-        position_gain: Array | None = None,
-        position_offset: Array | None = None,
+        calibration: CalibrationRecord | None = None,
     ) -> None:
         """beta (2n,) [kg·m]; rated torque (n,) [N·m]; max_velocity (n,) [rad/s]; period of a cycle [s].
 
-        position_gain and position_offset (n,) of the calibration record convert readings to true angles.
+        A calibration record converts readings to true angles.
         """
         self.config = config or FloatConfig()
         self._model, self._arm = GravityModel(arm, beta), arm
         self._rated, self._top, self._period = rated, max_velocity, period
-        self._gain = np.ones(arm.n) if position_gain is None else position_gain
-        self._offset = np.zeros(arm.n) if position_offset is None else position_offset
+        self._gain, self._offset = np.ones(arm.n), np.zeros(arm.n)
+        if calibration is not None:
+            self._gain = calibration.values("position_gain", 1.0)
+            self._offset = calibration.values("position_offset", 0.0)
         self._last: Array | None = None
         self._speed: Array = np.zeros(arm.n)
         self._detent: Array = np.zeros(arm.n)
@@ -156,12 +157,7 @@ def run_float(
     model disagree.
     """
     described, limits = gcomp_arm(arm), DriveLimits.of(arm)
-    given = (
-        ()
-        if calibration is None
-        else (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-    )
-    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, None, *given)
+    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, calibration=calibration)
     run = _Float(link, control, on_sample)
     run.compare(limits.rated)
     try:

@@ -258,35 +258,28 @@ def bin_readings(
     whole = np.isfinite(position).all(axis=1) & np.isfinite(torque[:, joint])
     position, torque, t = position[whole], torque[whole], t[whole]
     width = float(middles[1] - middles[0])
-    own = position[:, joint]
-    return [
-        _reading(position, torque, t, np.abs(own - middle) < width / 2, middle, width, joint, side, temperature)
-        for middle in middles
-    ]
-
-
-def _reading(
-    position: Array, torque: Array, t: Array, inside: Array, middle: float, width: float, joint: int, side: int,
-    temperature: Array | None,
-) -> StaticReading | None:  # fmt: skip
-    if inside.sum() < LEAST_SAMPLES:
-        return None
-    q, v, when = position[inside], torque[inside], t[inside]
-    weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)
-    weight /= weight.sum()
-    speed = float(slope(when, q[:, joint]))
-    if speed * side <= 0:
-        return None
-    mean_q, mean_v = weight @ q, weight @ v
-    return StaticReading.of(
-        float(when.mean()),
-        mean_q,
-        mean_v,
-        count=int(inside.sum()),
-        settled=True,
-        position_std=np.sqrt(np.maximum(weight @ (q - mean_q) ** 2, 0.0)),
-        torque_std=np.sqrt(np.maximum(weight @ (v - mean_v) ** 2, 0.0)),
-        motor_torque=mean_v,
-        speed=abs(speed),
-        temperature=temperature,
-    )
+    found: list[StaticReading | None] = [None] * len(middles)
+    for place, middle in enumerate(middles):
+        inside = np.abs(position[:, joint] - middle) < width / 2
+        q, v, when = position[inside], torque[inside], t[inside]
+        if len(q) < LEAST_SAMPLES:
+            continue
+        speed = float(slope(when, q[:, joint]))
+        if speed * side <= 0:
+            continue
+        weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)
+        weight /= weight.sum()
+        mean_q, mean_v = weight @ q, weight @ v
+        found[place] = StaticReading.of(
+            float(when.mean()),
+            mean_q,
+            mean_v,
+            count=len(q),
+            settled=True,
+            position_std=np.sqrt(np.maximum(weight @ (q - mean_q) ** 2, 0.0)),
+            torque_std=np.sqrt(np.maximum(weight @ (v - mean_v) ** 2, 0.0)),
+            motor_torque=mean_v,
+            speed=abs(speed),
+            temperature=temperature,
+        )
+    return found

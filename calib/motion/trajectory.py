@@ -111,24 +111,11 @@ def work_targets(
     random: np.random.Generator,
     motion: WorkMotion | None = None,
 ) -> Iterator[Array]:
-    """Position targets (n,) [rad], one a cycle of `period` [s], without end; as work_pieces has them."""
-    for piece in work_pieces(start, lower, upper, max_velocity, period, random, motion or WorkMotion()):
-        yield from piece
-
-
-def work_pieces(
-    start: Array,
-    lower: Array,
-    upper: Array,
-    max_velocity: Array,
-    period: float,
-    random: np.random.Generator,
-    motion: WorkMotion,
-) -> Iterator[Array]:
-    """Pieces (K, n) of position targets [rad] without end: the way to another pose and the rest there.
+    """Position targets (n,) [rad], one a cycle of `period` [s], without end: the way to another pose, the rest there, …
 
     `start` is where the arm is; lower and upper (n,) [rad] are its stops, max_velocity (n,) [rad/s].
     """
+    motion = motion or WorkMotion()
     middle, half = (lower + upper) / 2, np.maximum((upper - lower) / 2 - motion.margin, 0.0)
     here = np.array(start, dtype=float)
     while True:
@@ -137,7 +124,7 @@ def work_pieces(
             np.minimum(middle + half, here + motion.reach),
         )
         goal = random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
-        yield way_and_rest(here, goal, max_velocity, period, motion)
+        yield from way_and_rest(here, goal, max_velocity, period, motion)
         here = goal
 
 

@@ -136,17 +136,16 @@ class CauseTest:
         Drawn towards nothing where the rows tell little.
         """
         std = self.belief.change_std
-        places = [self._index(cause, joint) for cause in ("gain", "offset")]
         columns = np.zeros((len(self._residual), 2))
-        for place, index in enumerate(places):
-            if index is not None:
-                columns[:, [place]] = self._columns[index]
+        for place, cause in enumerate(("gain", "offset")):
+            if (cause, joint) in self._index:
+                columns[:, [place]] = self._columns[self._index[cause, joint]]
         fit = linear_posterior(columns, self._residual, np.zeros(2), std)
         return fit.x, fit.covariance
 
     def denies(self, cause: str, joints: tuple[int, ...], values: Array) -> bool:
         """Whether these rows show that an earlier change of these values is there no more."""
-        own = self._index(cause, joints[0] if joints else None)
+        own = self._index.get((cause, joints[0] if joints else None))
         if own is None:
             return cause not in CAUSES or not joints
         fit = self._fit(own)
@@ -160,7 +159,7 @@ class CauseTest:
     def noticed(self, cause: str, joint: int) -> float:
         """Size of a change of one parameter that wins in one case of two: over "none", and over every rival; NaN if no
         row tells it."""
-        index, entries = self._index(cause, joint), self.hypotheses
+        index, entries = self._index.get((cause, joint)), self.hypotheses
         if index is None:
             return float("nan")
         rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
@@ -183,15 +182,14 @@ class CauseTest:
     def _bases(self) -> list[Array]:
         return [span(columns) for columns in self._columns]
 
-    def _index(self, cause: str, joint: int | None) -> int | None:
-        """Number of a hypothesis; None where there is none."""
-        known = [(each.cause, each.joint) for each in self.hypotheses]
-        return known.index((cause, joint)) if (cause, joint) in known else None
+    @cached_property
+    def _index(self) -> dict[tuple[str, int | None], int]:
+        """(Cause, joint) → number of the hypothesis."""
+        return {(each.cause, each.joint): number for number, each in enumerate(self.hypotheses)}
 
     def _drift_fit(self, joint: int, cause: str, beside: int | None) -> ChangeFit:
         wanted = [(cause, joint)] if beside is None else [(cause, joint), ("drift", beside)]
-        known = [(each.cause, each.joint) for each in self.hypotheses]
-        return self._fit(*map(known.index, wanted))
+        return self._fit(*(self._index[each] for each in wanted))
 
     def _fit(self, *indices: int) -> ChangeFit:
         """Generalised least squares of entries together; columns that are collinear at these poses never win.

@@ -217,8 +217,7 @@ class GravityBelief:
 
     def carry(self, values: Array, covariance: Array) -> None:
         """Add a tool: mass [kg] and first moment [kg·m] (4,), covariance (4, 4), as a payload verdict has them."""
-        at_origin, by_point = payload_columns(self.arm)
-        columns = np.column_stack([at_origin, by_point])
+        columns = np.column_stack(payload_columns(self.arm))
         self.beta = self.beta + columns @ values
         square, vectors = np.linalg.eigh(covariance)  # 0 for what no lever shows
         self._tool = columns @ (vectors * np.sqrt(np.maximum(square, 0.0)))
@@ -253,9 +252,8 @@ class GravityBelief:
             return
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(self._first_rows, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
-        at_origin, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, rows.position)
-        payload = regressor @ np.column_stack([at_origin, by_point])
+        payload = regressor @ np.column_stack(payload_columns(self.arm))
         free = [payload.swapaxes(0, 1)]
         for epoch in np.unique(rows.epoch):
             within = (rows.epoch == epoch).astype(float)

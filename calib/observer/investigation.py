@@ -25,7 +25,7 @@ class Investigation:
         self.clear()
 
     def clear(self) -> None:
-        self.next_window()
+        self.cut(self._sizes.overlap)
         self.fresh = self.repeated = self.carrying = 0
         """New rows since the last test; repeated poses; consecutive windows that found the same payload."""
         self.doubtful = 0
@@ -73,15 +73,8 @@ class Investigation:
         """The rows of a test without an alarm."""
         return self.window[-self._sizes.longest :]
 
-    def next_window(self) -> None:
-        """Begin the next window."""
-        self._keep(self._sizes.overlap)
-
-    def forget_oldest(self) -> None:
-        """Cut the window to its length."""
-        self._keep(self._sizes.longest)
-
-    def _keep(self, count: int) -> None:
+    def cut(self, count: int) -> None:
+        """Cut the window to so many rows, the newest: to its overlap where the next one begins."""
         leaving = max(0, len(self.window) - count)
         self.window, self.learned = self.window[leaving:], max(0, self.learned - leaving)
 

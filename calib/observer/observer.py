@@ -69,6 +69,10 @@ class Estimate:
     accepted: Array
     """Rows that went into each."""
 
+    def as_json(self) -> dict[str, list[float]]:
+        """All but `accepted`, as lists."""
+        return {name: getattr(self, name).tolist() for name in ("gain", "gain_std", "offset", "offset_std")}
+
 
 class Observer:
     """`handle(sample)` → events; `estimate()`; `install(finding)` after a new calibration was written."""
@@ -267,7 +271,7 @@ class Observer:
                 self._estimate(test)
             gone, state.reported = state.reported is not None, None
             return [self._verdict(t, verdict)] if gone else []
-        state.forget_oldest()
+        state.cut(sizes.longest)
         if verdict.cause not in ("unknown", "ambiguous"):  # an alarm follows if those last
             state.start(silent=True)
             if sizes.overlap:
@@ -286,13 +290,13 @@ class Observer:
         if verdict.cause == "ambiguous" and len(state.window) < sizes.longest:
             return []  # more rows may decide
         if verdict.cause == "none" and state.reported and not test.denies(*state.reported, state.size):
-            state.forget_oldest()
+            state.cut(sizes.longest)
             return []  # these rows do not show the change that was found, nor that it is gone
         if state.silent and not self._is_confirmed(verdict):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window = state.window
-        state.next_window()
+        state.cut(sizes.overlap)
         if state.doubtful == 1:
             return []  # the cause may have changed within this window: wait for another one
         if not belief.of_sensors:
@@ -321,7 +325,7 @@ class Observer:
         if self._is_repeated(verdict):
             return True
         state.first = state.window if verdict.is_drift else []
-        state.next_window()
+        state.cut(self._sizes.overlap)
         return False
 
     def _is_repeated(self, verdict: Verdict) -> bool:

@@ -193,7 +193,7 @@ class Recalibrator:
         admitted = admit_drift(new, self._reference, j, self._arm)
         check = self._check_of(new, {j: old})
         self._install(admitted, by, new.note, (j,))
-        self._installed(new, self.record.id, (j,), check)
+        self.record, self._before, self._written, self._check = new, self.record.id, (j,), check
 
     def restore(self) -> tuple[str, ...]:
         """Write the whole current record to controllers that hold something else; returns the joints written.
@@ -207,7 +207,7 @@ class Recalibrator:
         check = self._check_of(self.record, dict(enumerate(held)))
         written = self._install(admitted, RESTORED_BY, "the drives held another calibration")
         if admitted.before is not None:
-            self._installed(self.record, admitted.before.id, tuple(range(len(held))), check)
+            self._before, self._written, self._check = admitted.before.id, tuple(range(len(held))), check
         return written
 
     def sample(self, t: float, position: Array, torque: Array) -> Checked | None:
@@ -267,12 +267,6 @@ class Recalibrator:
             return None
         new = {j: record.joints[j].torque_calibration(held) for j, held in old.items()}
         return AfterWrite(self._arm, gravity, record, old, new)
-
-    def _installed(
-        self, record: CalibrationRecord, before: str, written: tuple[int, ...], check: AfterWrite | None
-    ) -> None:
-        """A record is in force, after the record of id `before`."""
-        self.record, self._before, self._written, self._check = record, before, written, check
 
     def _swept(self, record: CalibrationRecord) -> CalibrationRecord:
         """The last record of this line that the observer did not make: what drift is bounded against."""

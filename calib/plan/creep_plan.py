@@ -139,10 +139,8 @@ class CreepingArm(PlannedArm):
         """Reference mass to attach [kg]."""
         if self.section.reference_mass is not None:
             return self.section.reference_mass
-        random = np.random.default_rng(0)
-        poses = random.uniform(*self.ends, (400, self.arm.n))
         at_origin, by_point = payload_columns(self.arm)
-        each = gravity_regressor(self.arm, poses)
+        each = gravity_regressor(self.arm, self.drawn_poses(400, np.random.default_rng(0)))
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
         share = BLIND_SHARE if self.guess is None else MASS_SHARES[0]
         most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)

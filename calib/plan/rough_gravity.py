@@ -124,9 +124,12 @@ def is_vertical(arm: Arm, joint: int) -> bool:
 
 def known_lever(arm: Arm) -> float:
     """Lever of a mass whose place on the last link is not known [m]: what the place cannot take up, RMS over poses."""
-    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (50, arm.n))
-    regressor = gravity_regressor(arm, poses)
-    at_origin, by_point = payload_columns(arm)
-    lever, moved = (regressor @ at_origin).ravel(), (regressor @ by_point).reshape(-1, 3)
-    rest = lever - moved @ np.linalg.lstsq(moved, lever, rcond=None)[0]
+    rest = known_torques(arm, np.random.default_rng(1).uniform(-1.5, 1.5, (50, arm.n)))
     return float(np.sqrt(np.mean(rest**2)) / np.linalg.norm(arm.gravity))
+
+
+def known_torques(arm: Arm, poses: Array) -> Array:
+    """Torques (K n,) [N·m] of 1 kg at poses (K, n) [rad] that its place on the last link cannot take up."""
+    regressor, (at_origin, by_point) = gravity_regressor(arm, poses), payload_columns(arm)
+    torque, moved = (regressor @ at_origin).ravel(), (regressor @ by_point).reshape(-1, 3)
+    return np.asarray(torque - moved @ np.linalg.lstsq(moved, torque, rcond=None)[0])

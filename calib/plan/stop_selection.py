@@ -94,7 +94,15 @@ class StopDesign:
         """
 
         def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
-            return TRAVEL_COST * _seconds(self.candidates, chosen, place, slot, speed)
+            """Price (C,) of the way to each candidate for a slot, from the sweep before it and on to the next one."""
+            here, seconds = self.candidates[place], np.zeros(self.candidates[place].count)
+            way = [(other, number) for other, picks in enumerate(chosen) for number in range(len(picks))]
+            before = [each for each in way if each < (place, slot)][-1:]
+            after = [each for each in way if each > (place, slot)][:1]
+            for other, number in before + after:
+                there = self.candidates[other].poses[chosen[other][number], 0]
+                seconds += (np.abs(here.poses[:, 0] - there) / speed).max(axis=1)
+            return TRAVEL_COST * seconds
 
         return select(self.rows, self.prior, counts, cost=travel)
 
@@ -105,18 +113,6 @@ def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:
     length = np.linalg.norm(kinematics.span, axis=1)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
     return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(3)]
-
-
-def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:
-    """Time (C,) [s] to each candidate for one slot from the sweep before it, and on to the one after it."""
-    here, time = candidates[place], np.zeros(candidates[place].count)
-    way = [(other, number) for other, picks in enumerate(chosen) for number in range(len(picks))]
-    before = [each for each in way if each < (place, slot)][-1:]
-    after = [each for each in way if each > (place, slot)][:1]
-    for other, number in before + after:
-        there = candidates[other].poses[chosen[other][number], 0]
-        time += (np.abs(here.poses[:, 0] - there) / speed).max(axis=1)
-    return time
 
 
 def _prior_std(guess: Parameters, sigma: Array) -> Array:

@@ -113,8 +113,6 @@ class JudgedRows:
     """(S, n) [N·m]."""
     change_std: Array
     """Of its change (S, n) [N·m]."""
-    deviation: Array
-    """Of all joints, (S,)."""
 
 
 class ContactDetector:
@@ -145,22 +143,14 @@ class ContactDetector:
         std, change_std = model.lasting.std(rows.state, own), model.sudden.std(rows.state, of_change)
         left = -rows.left
         loaded = -(rows.by_link @ self._load_columns)
-        external, deviation = np.empty_like(left), np.empty(len(left))
+        external = np.empty_like(left)
         for row in range(len(left)):
             external[row] = left[row] - loaded[row] @ self.load - self._drift
             scaled = external[row] / std[row]
-            deviation[row] = scaled @ self._lasting_inverse @ scaled
-            events += self._row(
-                float(t[row]),
-                external[row],
-                std[row],
-                change_std[row],
-                float(deviation[row]),
-                loaded[row],
-                rows.motion,
-                row,
-            )
-        return JudgedRows(external, std, change_std, deviation), events
+            deviation = float(scaled @ self._lasting_inverse @ scaled)
+            at = float(t[row]), external[row], std[row], change_std[row], deviation, loaded[row]
+            events += self._row(*at, rows.motion, row)
+        return JudgedRows(external, std, change_std), events
 
     def _away(self, columns: Array) -> Array:
         """Columns (S, n, Q) less what they were before."""

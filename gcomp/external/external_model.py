@@ -171,10 +171,6 @@ class ExternalModel:
         """For samples of this rate [Hz]."""
         return RowFilter(self.arm, self.links, rate, stride_of(rate))
 
-    def external(self, filtered: FilteredRows) -> Array:
-        """External torque at every sample (K, n) [N·m]: what the surroundings push the joints with."""
-        return np.asarray(filtered.links + (filtered.joints * self.joints).sum(-1) - filtered.torque)
-
     def rows(self, filtered: FilteredRows) -> TorqueRows:
         return rows_of(filtered, self.split, self.joints)
 

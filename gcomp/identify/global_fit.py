@@ -1,7 +1,7 @@
 """Global identification: sensors, mass moments and load point from all data at once (docs/theory.md, section 7)."""
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,15 +23,11 @@ DOUBT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class GlobalFit:
-    """Result of the global identification. Known families keep their given values, with std 0."""
+class Precision:
+    """Which parameters the readings determine, and how exactly."""
 
-    values: Parameters
-    """Estimates; NaN if not identifiable."""
     std: Parameters
     """Standard deviations; inf if not identifiable, 0 if known."""
-    complete: Parameters
-    """Estimates, all finite: parameters that are not identifiable have the values of the start."""
     names: tuple[str, ...]
     """Names of the p estimated parameters."""
     covariance: Array
@@ -40,6 +36,16 @@ class GlobalFit:
     """Those that the readings and priors determine (p,)."""
     null_space: tuple[str, ...]
     """Parameters that the readings cannot separate, one sentence per null direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalFit(Precision):
+    """Result of the global identification. Known families keep their given values, with std 0."""
+
+    values: Parameters
+    """Estimates; NaN if not identifiable."""
+    complete: Parameters
+    """Estimates, all finite: parameters that are not identifiable have the values of the start."""
     hopeless: tuple[str, ...]
     """Parameters that are determined, but with a standard deviation beyond MAX_STD."""
     residual: Array
@@ -115,22 +121,10 @@ def _starts(problem: LeastSquaresProblem, begin: Parameters) -> Iterator[Paramet
         bare = problem.readings.rows(~loaded)
         if bare.counted.any():
             plain = linear_start(problem.arm, bare, begin, problem.free)
-            found = Parameters.from_vector(solve(problem.on(bare).near(begin), plain).vector, n)
+            found = Parameters.from_vector(solve(replace(problem, readings=bare).near(begin), plain).vector, n)
             yield linear_start(problem.arm, problem.readings, found, problem.free, keep_ratios=True)
     yield linear_start(problem.arm, problem.readings, begin, problem.free)
     yield begin
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Precision that readings at given poses would give, before anything moves."""
-
-    std: Parameters
-    """Standard deviations; inf if not identifiable, 0 if known."""
-    names: tuple[str, ...]
-    covariance: Array
-    identifiable: Mask
-    null_space: tuple[str, ...]
 
 
 def predict_covariance(
@@ -141,8 +135,8 @@ def predict_covariance(
     unknown: Collection[str],
     priors: Mapping[str, Prior] | None = None,
     position_sigma: ArrayLike = 0.0,
-) -> Prediction:
-    """Covariance that identify_global would report for readings at the design's positions and loads.
+) -> Precision:
+    """Precision that identify_global would report for readings at the design's positions and loads.
 
     NaN in the design's torques marks readings that would not count; other torques are not used. `guess` is the
     parameters expected.
@@ -153,15 +147,7 @@ def predict_covariance(
         arm, expected, unknown, priors or {}, position_sigma, natural_units(arm, expected, guess)
     )
     weight = problem.weights(guess.vector)
-    information = analyse(problem.factor(guess.vector, weight)[0], problem.unit[problem.free])
-    names, std = _names_and_std(problem, information)
-    return Prediction(
-        Parameters.from_vector(std, arm.n),
-        names,
-        information.covariance,
-        information.determined,
-        describe_null_space(information.null_basis, names),
-    )
+    return _precision(problem, analyse(problem.factor(guess.vector, weight)[0], problem.unit[problem.free]))
 
 
 def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
@@ -170,31 +156,28 @@ def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
     return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
 
 
-def _names_and_std(problem: LeastSquaresProblem, information: Information) -> tuple[tuple[str, ...], Array]:
-    """(Names of the estimated parameters, standard deviations (6n + 3,): 0 if known, inf if not determined)."""
+def _precision(problem: LeastSquaresProblem, information: Information) -> Precision:
     names = tuple(name for name, free in zip(parameter_names(problem.arm), problem.free, strict=True) if free)
     std = np.zeros(len(problem.free))
     spread = np.sqrt(np.diag(information.covariance))
     std[problem.free] = np.where(information.determined, spread, np.inf)
-    return names, std
+    null_space = describe_null_space(information.null_basis, names)
+    known = Parameters.from_vector(std, problem.arm.n)
+    return Precision(known, names, information.covariance, information.determined, null_space)
 
 
 def _report(problem: LeastSquaresProblem, outcome: Outcome) -> GlobalFit:
-    n, information = problem.arm.n, outcome.information
-    names, std = _names_and_std(problem, information)
+    n, found = problem.arm.n, _precision(problem, outcome.information)
+    std = found.std.vector
     values = np.where(np.isinf(std), np.nan, outcome.vector)
     limit = np.concatenate([np.full(place.stop - place.start, MAX_STD[f]) for f, place in family_slices(n).items()])
-    beyond = (std > limit * problem.unit)[problem.free] & information.determined
+    beyond = (std > limit * problem.unit)[problem.free] & found.identifiable
     complete = Parameters.from_vector(outcome.vector, n)
     return GlobalFit(
+        **vars(found),
         values=Parameters.from_vector(values, n),
-        std=Parameters.from_vector(std, n),
         complete=complete,
-        names=names,
-        covariance=information.covariance,
-        identifiable=information.determined,
-        null_space=describe_null_space(information.null_basis, names),
-        hopeless=tuple(name for name, is_beyond in zip(names, beyond, strict=True) if is_beyond),
+        hopeless=tuple(name for name, is_beyond in zip(found.names, beyond, strict=True) if is_beyond),
         residual=problem.readings.torque - predict(problem.arm, complete, problem.readings),
         chi2=outcome.chi2,
         dof=outcome.dof,

@@ -52,9 +52,6 @@ class LeastSquaresProblem:
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, noise, unit)
 
-    def on(self, readings: StaticReadings) -> "LeastSquaresProblem":
-        return replace(self, readings=readings)
-
     def near(self, guess: Parameters) -> "LeastSquaresProblem":
         """With a prior about `guess` on gains that have none."""
         gain = Prior(guess.gain, GAIN_STD * np.abs(guess.gain))
@@ -142,7 +139,13 @@ def solve(problem: LeastSquaresProblem, first: Parameters) -> Outcome:
         if problem.reweighted:
             weight = problem.weights(vector)
             cost = problem.cost(vector, weight)
-    return _finish(problem, vector, cost, converged)
+    information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
+    parameters = Parameters.from_vector(vector, problem.arm.n)
+    blocks = problem.readings.blocks()
+    residual = [(block.torque - predict(problem.arm, parameters, block))[block.counted] for block in blocks]
+    scaled = np.concatenate(residual) * np.concatenate(weight)
+    dof = len(scaled) - information.rank
+    return Outcome(vector, information, cost, float(scaled @ scaled), dof, converged)
 
 
 def _step(
@@ -165,19 +168,6 @@ def _step(
             return trial, trial_cost, damping / 10 if damping > 1e-3 * weakest else 0.0
         damping = max(10 * damping, 0.1 * weakest)
     return None, cost, damping
-
-
-def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, converged: bool) -> Outcome:
-    """Covariance and goodness of fit at the end."""
-    weight = problem.weights(vector)
-    information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
-    residual = [
-        (block.torque - predict(problem.arm, Parameters.from_vector(vector, problem.arm.n), block))[block.counted]
-        for block in problem.readings.blocks()
-    ]
-    scaled = np.concatenate(residual) * np.concatenate(weight)
-    dof = len(scaled) - information.rank
-    return Outcome(vector, information, cost, float(scaled @ scaled), dof, converged)
 
 
 def fold(triangle: Array, rows: Array) -> Array:

@@ -153,13 +153,10 @@ class MotorModel:
         found = Parameters.nominal(self.n, position_offset=x[self.slices["zero"]], **of)
         return found, replace(self.readings, position=moved)
 
-    def gravity(self, x: Array) -> Array:
-        """Gravity torque of each row's joint (R,) [N·m]."""
-        return predict(self.arm, *self._gravity(x))[self._each, self.joint]
-
     def predict(self, x: Array) -> Array:
         """Readings (R,) [N·m] for the parameter vector x."""
-        gain, scale, motor = self._motor(x, self.gravity(x))
+        torque = predict(self.arm, *self._gravity(x))[self._each, self.joint]
+        gain, scale, motor = self._motor(x, torque)
         return np.asarray(gain * scale * motor + x[self.slices["offset"]][self.joint])
 
     def _motor(self, x: Array, torque: Array) -> tuple[Array, Array, Array]:

@@ -33,7 +33,7 @@ from armlink.errors import BusFault, Refused, Stall
 from armlink.link.types import Command
 from armlink.termination import terminate_as_interrupt
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.trajectory import WorkMotion, work_pieces
+from calib.motion.trajectory import WorkMotion, work_targets
 
 CAUSES: dict[str, Callable[[], BaseException | None]] = {
     "done": lambda: None,
@@ -56,8 +56,7 @@ def work(bench: EndsBench, seed: int) -> Any:
     arm, link = gcomp_arm(bench.arm), bench.link
     speed = np.array([joint.max_velocity for joint in bench.arm.require_link().joints])
     random = np.random.default_rng(seed)
-    pieces = work_pieces(link.position_sent, arm.lower, arm.upper, speed, link.period, random, WorkMotion(reach=10.0))
-    return itertools.chain.from_iterable(pieces)
+    return work_targets(link.position_sent, arm.lower, arm.upper, speed, link.period, random, WorkMotion(reach=10.0))
 
 
 def commands(bench: EndsBench, job: str, seed: int) -> Callable[[], None]:

@@ -100,11 +100,6 @@ class ObserverFeed:
         self.last_accepted |= {self.names[j]: now for j in np.flatnonzero(self.observer.accepted > before)}
         return events
 
-    def point(self) -> dict[str, list[float]]:
-        """A point of history: gain, offset [N·m] and their standard deviations, one value per joint."""
-        estimate = self.observer.estimate()
-        return {name: getattr(estimate, name).tolist() for name in ("gain", "gain_std", "offset", "offset_std")}
-
 
 def _mean(groups: Array) -> Array:
     """Mean over axis 1 of the readings that are not missing; NaN if all are."""
@@ -139,7 +134,7 @@ class ObserverStorage:
         with self._journal.transaction():
             self._journal.save_belief(now, feed.calibration.id, feed.carried.id, feed.observer.save())
             if history:
-                self._journal.add_history(now, t, feed.calibration.id, feed.point())
+                self._journal.add_history(now, t, feed.calibration.id, feed.observer.estimate().as_json())
                 self._history_at = t
         self._saved_at, self._rows = t, feed.observer.rows
 

@@ -153,10 +153,10 @@ class TooMany(Exception):
 
 
 class Histories:
-    """GET /api/history, and whatever else reads the history."""
+    """Whatever reads the history, such as GET /api/history."""
 
-    def __init__(self, view: DaemonView) -> None:
-        self._view, self._under_way = view, Counter[str]()
+    def __init__(self) -> None:
+        self._under_way = Counter[str]()
         self._thread = ThreadPoolExecutor(1, "history")
         self._short = ThreadPoolExecutor(1, "events")
 
@@ -178,11 +178,6 @@ class Histories:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
         finally:
             self._under_way[owner] -= 1
-
-    async def answer(self, owner: str, query: HistoryQuery) -> StreamingResponse:
-        """The points that a query asks for; raises NoSuch, TooMany."""
-        pages = self._view.history_pages(query.joint or None, query.since, query.until, query.limit)
-        return await self.send(owner, _as_json(pages), bytes, "application/json")
 
     async def send(
         self,
@@ -207,7 +202,7 @@ class Histories:
             self._under_way[owner] -= 1
 
 
-def _as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:
+def points_as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:
     separator = b"["
     for page in pages:
         if page:

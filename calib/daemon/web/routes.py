@@ -40,6 +40,7 @@ from calib.daemon.web.history import (
     StreamQuery,
     TooMany,
     add_window,
+    points_as_json,
 )
 from calib.daemon.web.stream import StreamResponse, Streams
 
@@ -158,7 +159,8 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
     async def history(owner: Owner, query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, one joint after the other."""
-        return await histories.answer(owner, query)
+        pages = view.history_pages(query.joint or None, query.since, query.until, query.limit)
+        return await histories.send(owner, points_as_json(pages), bytes, "application/json")
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:

@@ -18,7 +18,7 @@ RETRY = b"retry: 2000\n\n"
 
 class Streams:
     def __init__(self, view: DaemonView) -> None:
-        self._view, self.histories = view, Histories(view)
+        self._view, self.histories = view, Histories()
         self._tasks: dict[asyncio.Task[None], str] = {}
         """Whose each is, the oldest first."""
         self._item: JointsItem | None = None

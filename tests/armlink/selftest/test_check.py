@@ -13,7 +13,7 @@ import yaml
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
 from armlink.commands.check import _outcomes
-from armlink.drives.canopen.check.power_test import PowerTest
+from armlink.drives.canopen.check.self_test import POWER_CHECKS
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.drives.findings import HOLD_TOLERANCE, Result
 from armlink.link.link import Link
@@ -123,7 +123,7 @@ def test_the_joints_do_not_move(simulated):
 def test_without_power_nothing_is_enabled(simulated):
     results = self_test(simulated, power=False)
     assert [node.value(0x6041) & 0x4F for node in simulated.nodes] == [0x40] * 2
-    for check in PowerTest.CHECKS:
+    for check in POWER_CHECKS:
         assert outcomes(results, check) == ["not run"] * 2
     assert "failed" not in {each.outcome for each in results.values()}
 

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.check.power_test import PowerTest
-from armlink.drives.canopen.check.self_test import CanopenSelfTest
+from armlink.drives.canopen.check.self_test import POWER_CHECKS, CanopenSelfTest
 from armlink.drives.canopen.cia402 import DriveState
 from armlink.drives.findings import Checks
 from armlink.errors import BusFault
@@ -16,9 +15,9 @@ class Bench:
     """A test of two joints that drives none; the second one has no deadline for commands."""
 
     def __init__(self, start=lambda: None):
-        self.checks, self.silenced = Checks(), []
+        self.silenced = []
         loop = SimpleNamespace(withheld=None)
-        link = SimpleNamespace(n=2, names=("a", "b"), period=0.004, start=start)
+        link = SimpleNamespace(n=2, names=("a", "b"), period=0.004, start=start, ask=None)
         link.commander = SimpleNamespace(loop=loop, passed=())
         has = [SimpleNamespace(has=lambda entry: True), SimpleNamespace(has=lambda entry: False)]
         self.known = SimpleNamespace(emergencies=[], node_states={})
@@ -26,8 +25,11 @@ class Bench:
             cycle=SimpleNamespace(beating=False),
             wires=[SimpleNamespace(profile=each) for each in has],
             known=self.known,
+            m=2,
+            services=lambda ask: (),
         )
-        self.test = PowerTest(link, drives, self.checks, lambda text: None)
+        self.test = CanopenSelfTest(link, drives, [], lambda text: None)
+        self.checks = self.test.checks
         for name in ("_without_torque", "_require_watch", "_enable", "_no_heartbeat"):
             setattr(self.test, name, lambda: None)
         self.test._quick_stop = lambda joint: None
@@ -43,14 +45,14 @@ def test_what_a_fault_kept_from_being_reached_is_told_with_the_fault_once_as_fai
         raise BusFault("a: no answer")
 
     bench = Bench(start)
-    bench.test.run()
-    assert bench.told[0][:4] == ("a", PowerTest.CHECKS[0], "failed", "a: no answer")
-    assert [each[2:4] for each in bench.told[1:]] == [("not run", "a: no answer")] * (2 * len(PowerTest.CHECKS) - 1)
+    bench.test._with_power(True)
+    assert bench.told[0][:4] == ("a", POWER_CHECKS[0], "failed", "a: no answer")
+    assert [each[2:4] for each in bench.told[1:]] == [("not run", "a: no answer")] * (2 * len(POWER_CHECKS) - 1)
 
 
 def test_a_joint_without_a_deadline_is_not_left_without_commands():
     bench = Bench()
-    bench.test.run()
+    bench.test._with_power(True)
     assert bench.silenced == [0]
     assert ("b", "RPDO deadline", "absent") in [each[:3] for each in bench.told]
 
@@ -90,15 +92,13 @@ def test_a_joint_that_loses_its_power_is_told_with_its_emergency():
         ("passed", True, None),
     ],
 )
-def test_no_joint_is_driven_unless_asked_for_and_all_before_has_passed(outcome, power, says, monkeypatch):
+def test_no_joint_is_driven_unless_asked_for_and_all_before_has_passed(outcome, power, says):
     ran, checks = [], Checks()
     checks.add("a", "units", outcome, "")
-    monkeypatch.setattr(PowerTest, "run", lambda test: ran.append(test))
-    monkeypatch.setattr(PowerTest, "__init__", lambda *given: None)
     link = SimpleNamespace(names=("a", "b"))
-    test = SimpleNamespace(checks=checks, link=link, drives=None, progress=None)
+    test = SimpleNamespace(checks=checks, link=link, _check_with_power=lambda: ran.append(test))
     CanopenSelfTest._with_power(test, power)
     told = checks.results[1:]
     assert len(ran) == (says is None)
     assert {(each.outcome, each.found) for each in told} == ({("not run", says)} if says else set())
-    assert len(told) == (2 * len(PowerTest.CHECKS) if says else 0)
+    assert len(told) == (2 * len(POWER_CHECKS) if says else 0)
