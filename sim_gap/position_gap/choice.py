@@ -300,7 +300,7 @@ class Stage:
     worth: float
     """Fall of the held-out cost of training rows by it, all else fitted again without it."""
     evidence: float
-    """What of it nothing else would have brought."""
+    """The part of it that nothing else would have brought."""
     rivals: tuple[str, ...]
     """Effects that would do as well."""
 

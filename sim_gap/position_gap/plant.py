@@ -104,7 +104,7 @@ def servos_of(sim: SimModel) -> tuple[NDArray[np.intp], dict[str, Array]]:
             own["ki"][j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
             own["slew"][j] = slew / abs(gear) if slew > 0.0 else np.inf
         own["delay"][j] = model.actuator_delay[i]
-        if model.actuator_dyntype[i] in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+        if int(model.actuator_dyntype[i]) in map(int, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)):
             own["lag"][j] = model.actuator_dynprm[i, 0]
     return actuator, own
 

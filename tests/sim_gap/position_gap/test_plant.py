@@ -151,6 +151,14 @@ def test_a_models_own_pid_and_delay_are_its_controllers() -> None:
     assert (shoulder[1:] == [0.0, 0.0, np.inf, np.inf, 0.0]).all()
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_models_own_filter_of_the_command_is_its_controllers(exact: bool) -> None:
+    spec = mujoco.MjSpec.from_string(MODELS["a filter in the actuators"])
+    for servo in spec.actuators:
+        servo.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
+    assert servos_of(load_model(spec.compile()))[1]["lag"].tolist() == [0.05, 0.05]
+
+
 def test_the_efforts_that_a_urdf_states_limit_its_servos() -> None:
     text = model_text(kp=40.0, friction=0.0, limits=(3.0, 3.0)).replace(
         '<joint name="elbow"', '<joint name="elbow" actuatorfrcrange="-2 2"'
