@@ -58,14 +58,15 @@ def diagnose_positions(
     found = identify(sim, train, heldout, labels, withhold, progress, gains)
     progress("replaying the corrected model")
     share = _left(found)
-    made = [_cause(found, stage, share) for stage in found.stages]
-    taken = [
-        (c, stage)
-        for c, stage in zip(made, found.stages, strict=True)
-        if stage.worth > PRICE and _lowers(found, stage) and _differs(found, stage)
-    ]
+    taken, minor = [], list[Cause]()
+    for stage in found.stages:
+        changed, as_before = _apart(found, stage)
+        if changed is not None and stage.worth > PRICE and _lowers(found, stage):
+            taken.append((_cause(found, changed, share), stage))
+            minor += [] if as_before is None else [_cause(found, as_before, share)]
+        else:
+            minor.append(_cause(found, stage, share))
     causes = [c for c, _ in taken]
-    minor = [c for c in made if c not in causes]
     verdict = _verdict(found, causes, share)
     if verdict == "no_gap":
         taken, causes, minor = [], [], [*causes, *minor]
@@ -109,13 +110,23 @@ def _lowers(found: Identified, stage: Stage) -> bool:
     return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
 
 
-def _differs(found: Identified, stage: Stage) -> bool:
-    """Whether some parameter's interval leaves out the nominal value."""
-    for j, name in found.search.places_of(stage.group):
-        own = interval(found.search, found.fit, found.within, j, name)
-        if not own.low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= own.high:
-            return True
-    return False
+def _apart(found: Identified, stage: Stage) -> tuple[Stage | None, Stage | None]:
+    """The stage at the joints where some parameter's interval leaves out the nominal value, and at the others."""
+    effect, joints = stage.group
+
+    def differs(at: tuple[int, ...]) -> bool:
+        for j, name in found.search.places_of((effect, at)):
+            own = interval(found.search, found.fit, found.within, j, name)
+            if not own.low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= own.high:
+                return True
+        return False
+
+    if not joints:
+        return (stage, None) if differs(()) else (None, stage)
+    changed = tuple(j for j in joints if differs((j,)))
+    others = tuple(j for j in joints if j not in changed)
+    first, second = (replace(stage, group=(effect, each)) if each else None for each in (changed, others))
+    return first, second
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
