@@ -181,7 +181,7 @@ def recorded_joints(
     """Those of the known joints that a recording has: by its names, else in order, and then slides only if the hinges
     alone are not as many. Raises BadInput if their number does not fit."""
     if not known:
-        raise BadInput(f"{label}: the model has no joint: expected the arm as a chain of joints")
+        raise BadInput(f"{label}: the model has no hinge or slide: expected the arm as a chain of joints")
     if names and all(name in known for name in names):
         return [known[name] for name in names]
     hinges = {name: joint for name, joint in known.items() if not is_slide(model, joint)}

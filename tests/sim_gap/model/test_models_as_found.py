@@ -63,7 +63,7 @@ def test_a_file_of_another_kind_is_one_line(tmp_path, name, says):
 
 def test_a_model_without_joints_says_so(tmp_path):
     (tmp_path / "arm.urdf").write_text('<robot name="a"><link name="base"/></robot>')
-    with pytest.raises(BadInput, match="the model has no joint"):
+    with pytest.raises(BadInput, match="the model has no hinge or slide"):
         load_model(tmp_path / "arm.urdf", (), 3)
 
 
