@@ -262,7 +262,7 @@ def interval(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, n
     for limit in spread.limits:
         if (limit.joint, limit.name) == (joint, name):
             value = float(fit.point[name][joint])
-            unit = search.data.plant.sim.arm.unit_at(joint, PARAMETERS[name].unit)
+            unit = search.arm.unit_at(joint, PARAMETERS[name].unit)
             return Value(value, limit.least, max(limit.most, value), unit)
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
@@ -273,7 +273,7 @@ def interval(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, n
     value, *ends = (float(point[name][max(joint, 0)]) for point in points)
     if joint < 0:
         return Value(value, min(ends), max(ends), UNIT[name.partition(".")[2]])
-    return Value(value, min(ends), max(ends), search.data.plant.sim.arm.unit_at(joint, PARAMETERS[name].unit))
+    return Value(value, min(ends), max(ends), search.arm.unit_at(joint, PARAMETERS[name].unit))
 
 
 def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> Value:
