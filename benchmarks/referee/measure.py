@@ -22,6 +22,8 @@ LEAST_SPEED = 0.02
 """Speed below which friction is not determined, so that a row does not count [rad/s] (sim_gap/blind/scene.py)."""
 TORQUE_WINDOW_S, POSITION_WINDOW_S = 0.25, 1.0
 """Length of a window [s]: under a recorded torque any arm strays with time."""
+PAST_S = 0.5
+"""Time before a window by which servos get their state."""
 SETTLING_S = 1.0
 """Time at both ends that is not judged: filters settle, and a simulation from rest."""
 FLOOR = {"share": 0.005, "position": 2e-4}
@@ -150,8 +152,8 @@ def _driven_by_commands(model: Any, ids: Any, servos: list[int], seen: Even, len
     whole = length >= len(seen.q)
     for start in [0] if whole else range(settling, len(seen.q) - settling - length, length):
         mujoco.mj_resetData(model, data)
+        _with_past_commands(model, data, at, dof, servos, seen, start)
         data.qpos[at], data.qvel[dof] = seen.q[start], 0.0 if whole else seen.v[start]
-        _past_commands(model, data, servos, seen.command, start)
         end = min(start + length, len(seen.q) - 1)
         made = np.empty((end - start, len(dof)))
         for k in range(start, end):
@@ -163,12 +165,12 @@ def _driven_by_commands(model: Any, ids: Any, servos: list[int], seen: Even, len
     return float(np.sqrt(np.mean(squares)))
 
 
-def _past_commands(model: Any, data: Any, servos: list[int], command: Any, start: int) -> None:
-    """The commands before a window, for servos with a delay."""
-    for j, servo in enumerate(servos):
-        if count := int(model.actuator_history[servo, 0]):
-            back = np.maximum(start - np.arange(count, 0, -1), 0)
-            mujoco.mj_initCtrlHistory(model, data, servo, None, command[back, j][:, None])
+def _with_past_commands(model: Any, data: Any, at: Any, dof: Any, servos: list[int], seen: Even, start: int) -> None:
+    """Let servos have the state that the commands and the motion before a window leave them in: filters, delays and
+    limits of their speed. Before the recording its first row holds."""
+    for row in np.maximum(np.arange(start - round(PAST_S / STEP_S), start), 0):
+        data.qpos[at], data.qvel[dof], data.ctrl[servos] = seen.q[row], seen.v[row] * (row > 0), seen.command[row]
+        mujoco.mj_step(model, data)
 
 
 def _square(made: Any, seen: Any) -> float:
