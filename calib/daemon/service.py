@@ -151,8 +151,7 @@ class Service:
         configuration.arm, configuration.settings = arm, settings
         try:
             if settings.observer != before[1].observer:
-                self.save()
-                self.records.renew()
+                self._renew()
         except Exception:
             configuration.arm, configuration.settings = before
             raise
@@ -192,6 +191,10 @@ class Service:
         if isinstance(found, Exception):
             raise found
         self.report = found
+
+    def _renew(self) -> None:
+        self.save()
+        self.records.renew()
 
     def _feed(self, feed: ObserverFeed, batch: Batch) -> None:
         """Give samples to all that observes them, unless the calibration changes under these readings."""

@@ -30,15 +30,18 @@ class EventLog:
 
     def say(self, kind: str, joint: str | None, text: str, evidence: dict[str, Any]) -> None:
         """Keep an event, within a transaction together with the rest of it; publish it; log it."""
-        text = " ".join(text.split())
-        level = logging.WARNING if kind in ("fault", "refused", "alarm") else logging.INFO
-        log.log(level, text, extra={"kind": kind, "joint": joint})
-        what = {"kind": kind, "joint": joint, "text": text, "evidence": finite(evidence)}
-        said: dict[str, Any] = {"time": self.now(), "t": self._monotonic(), **what}
+        said = self._logged(kind, joint, text, evidence)
         with self._journal.transaction():
             number = self._journal.add_event(**said)
             item = EventItem(event=EventRecord(id=number, **said))
             self._journal.once_kept(lambda: self._hub.publish(item))
+
+    def _logged(self, kind: str, joint: str | None, text: str, evidence: dict[str, Any]) -> dict[str, Any]:
+        text = " ".join(text.split())
+        level = logging.WARNING if kind in ("fault", "refused", "alarm") else logging.INFO
+        log.log(level, text, extra={"kind": kind, "joint": joint})
+        at = {"time": self.now(), "t": self._monotonic()}
+        return {**at, "kind": kind, "joint": joint, "text": text, "evidence": finite(evidence)}
 
     def tick(self) -> None:
         """Report that the wall clock, which dates the events, was set."""

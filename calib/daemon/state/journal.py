@@ -113,7 +113,7 @@ class Journal:
         self._rows: dict[int, ProposalRow] = {}
         self._unread = True
         """Something was written since the proposals were read."""
-        self.last_event = self._next_event = self._next_proposal = 0
+        self._last_event = self._next_event = self._next_proposal = 0
         self._belief: tuple[str | None, str | None, str] | None = None
         self.set_aside = ""
         """Name of a damaged journal that was set aside; empty if none was."""
@@ -213,7 +213,7 @@ class Journal:
         if not self._next_event:
             self._belief = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
         # ids go on where a file is begun anew, or another one takes its place, under way
-        self.last_event = max(self.last_event, event)
+        self._last_event = max(self._last_event, event)
         self._next_event, self._next_proposal = (
             max(number, one + 1) for number, one in ((self._next_event, event), (self._next_proposal, proposal))
         )
@@ -385,7 +385,7 @@ class Journal:
         statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
             self._write(statement, number, utc_text(time), t, kind, joint, text, json.dumps(evidence))
-            self.once_kept(lambda: setattr(self, "last_event", max(self.last_event, number)))
+            self.once_kept(lambda: setattr(self, "_last_event", max(self._last_event, number)))
         return number
 
     def events(self, after: int = 0, limit: int = 500) -> list[EventRecord]:
@@ -396,6 +396,10 @@ class Journal:
             if _is_damage(error):
                 self.failed(error)
             raise
+
+    @property
+    def last_event(self) -> int:
+        return self._last_event
 
     def least_ages(self, kind: str, now: float) -> list[tuple[str | None, dict[str, Any], float]]:
         """Joint, evidence and least age [s] of the newest events of a kind, by the monotonic clock alone.
