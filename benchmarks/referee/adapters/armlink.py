@@ -1,5 +1,6 @@
 """armlink: `armlink.diagnose`, and the model that `armlink gap diagnose --out-model` writes."""
 
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ def solve(case: Case) -> Answer:
     for cause in (*made.causes, *made.minor):
         for joint, values in cause.parameters.items():
             for quantity, each in values.items():
+                if not isfinite(each.value):  # a limit that is not there
+                    continue
                 name = f"{cause.effect}:{quantity}"
                 where = names.get(joint, "")
                 nominal = value_of(spec, JOINT_VALUES[name], where) if name in JOINT_VALUES else None
