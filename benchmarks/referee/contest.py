@@ -15,7 +15,6 @@ from typing import Any
 
 import mujoco
 
-from referee import score
 from referee.interface import Answer, answer_from_json, check, load_case
 from referee.measure import actuated
 
@@ -103,7 +102,7 @@ def run(tool: Tool, public: Path, cpu_seconds: float) -> dict[str, Any]:
 def judgeable(answer: Answer, public: Path) -> None:
     """Raise ValueError if an answer cannot be judged: its words, numbers and joints, and a model that MuJoCo takes."""
     case = load_case(public)
-    check(answer, case, score.TABLES["vocabularies"], score.FAMILY)
+    check(answer, case)
     if answer.model is not None:
         try:
             model = mujoco.MjModel.from_xml_string(answer.model)

@@ -7,7 +7,6 @@ an empty list "nothing found".
 
 import json
 import math
-from collections.abc import Container, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,20 @@ import numpy as np
 
 SCHEMA = "armlink.referee-answer/1"
 CHANNELS = ("q", "dq", "tau", "tau_motor", "tau_cmd", "q_cmd")
+
+
+TABLES = json.loads(Path(__file__).with_name("families.json").read_text(encoding="utf-8"))
+FAMILY = {effect: family for family, effects in TABLES["families"].items() for effect in effects}
+
+
+def target(name: str, vocabulary: str) -> str:
+    """`effect:quantity` of a tool's word; words that no table has are their own."""
+    return str(TABLES["vocabularies"].get(vocabulary, {}).get(name, name))
+
+
+def family(name: str, vocabulary: str) -> str:
+    effect = target(name, vocabulary).partition(":")[0]
+    return str(FAMILY.get(effect, effect))
 
 
 class NotOffered(Exception):
@@ -102,14 +115,14 @@ class Answer:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def check(answer: Answer, case: Case, words: Mapping[str, Mapping[str, str]], effects: Container[str]) -> None:
+def check(answer: Answer, case: Case) -> None:
     """Raise ValueError with what an answer must not have: a number that is none, an interval or confidence that cannot
-    be, a joint that the model lacks, a vocabulary or cause that `families.json` (`words`, `effects`) does not have."""
+    be, a joint that the model lacks, a vocabulary or cause that `families.json` does not have."""
+    words = TABLES["vocabularies"]
     if answer.vocabulary not in words:
         raise ValueError(f"vocabulary {answer.vocabulary!r} is not in families.json, which has {', '.join(words)}")
     for cause in answer.causes or ():
-        effect = words[answer.vocabulary].get(cause.name, cause.name).partition(":")[0]
-        if effect not in effects:
+        if target(cause.name, answer.vocabulary).partition(":")[0] not in FAMILY:
             raise ValueError(f"cause {cause.name!r}: the vocabulary {answer.vocabulary!r} of families.json lacks it")
         if not 0.0 <= cause.confidence <= 1.0:
             raise ValueError(f"cause {cause.name!r}: confidence {cause.confidence} instead of 0 to 1")

@@ -6,22 +6,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from referee.interface import Case, Parameter
+from referee.interface import Case, Parameter, target
 
 QUANTITIES = ("frictionloss", "damping", "armature", "kp")
 """`damping` is the joint's, and with positions alone the servo's too, since a position cannot tell them."""
-EFFECTS = {
-    "frictionloss": "friction.coulomb",
-    "damping": "friction.viscous",
-    "armature": "actuator.rotor_inertia",
-    "mass": "link.payload",
-}
-"""What may be withheld of them (`Case.withheld`)."""
 
 
 def allowed(case: Case, quantities: Iterable[str]) -> list[str]:
     """The quantities that a tool may estimate in this case."""
-    return [quantity for quantity in quantities if EFFECTS.get(quantity) not in case.withheld]
+    words = {quantity: "payload" if quantity == "mass" else quantity for quantity in quantities}
+    return [
+        quantity for quantity, word in words.items() if target(word, "mujoco").partition(":")[0] not in case.withheld
+    ]
 
 
 def spec_of(case: Case) -> Any:

@@ -1,17 +1,15 @@
 """Scores of answers against labels, their intervals over cases, and which differences are decided. Pure functions."""
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from referee.interface import Answer, Cause, Parameter
+from referee.interface import FAMILY, TABLES, Answer, Cause, Parameter, family, target
 
 SURE = 0.8
 """Confidence above which a cause is meant to be sure (interface.py)."""
@@ -24,8 +22,6 @@ WRONG_DECISIONS = 0.05
 DRAWS, WILSON_Z = 2000, 1.959964
 TINY = 1e-4
 """Relative errors and widths below this count as this; widths above its inverse, as those without an end, as that."""
-TABLES = json.loads(Path(__file__).with_name("families.json").read_text(encoding="utf-8"))
-FAMILY = {effect: family for family, effects in TABLES["families"].items() for effect in effects}
 Json = Mapping[str, Any]
 
 
@@ -70,16 +66,6 @@ SCORES = (
     Score("rollout", "roll-out error in MuJoCo / that of the nominal model", False, True, frozenset({"model"})),
     Score("cpu_seconds", "CPU time [s]", False, True, frozenset()),
 )
-
-
-def target(name: str, vocabulary: str) -> str:
-    """`effect:quantity` of a tool's word; words that no table has are their own."""
-    return str(TABLES["vocabularies"].get(vocabulary, {}).get(name, name))
-
-
-def family(name: str, vocabulary: str) -> str:
-    effect = target(name, vocabulary).partition(":")[0]
-    return str(FAMILY.get(effect, effect))
 
 
 def judge(answer: Answer, label: Json) -> dict[str, float | None]:
